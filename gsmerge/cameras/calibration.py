@@ -1,7 +1,7 @@
 """Calibrate cameras from points and their pixels: poses, and intrinsics for each view or common to all.
 
-Intrinsics are as simple as the points allow. Of several models, the one with the smallest Bayesian information
-criterion is chosen (Schwarz 1978).
+Intrinsics are as simple as the points allow. Of several models of cameras, the model with the smallest Bayesian
+information criterion is chosen (Schwarz 1978).
 """
 
 from __future__ import annotations
@@ -37,15 +37,15 @@ _FAR, _FAR_PX = 3.0, 1.0
 
 @dataclass(frozen=True)
 class Calibration:
-    """Cameras of v views, and the distance of the points from their pixels."""
+    """Cameras of v views, and the distance of points from their pixels in the worst view."""
 
     cameras: Cameras
-    worst_px: float  # largest median distance of a view, pixels
+    worst_px: float  # largest median distance of a view's points from their pixels, pixels
 
 
 @dataclass(frozen=True, eq=False)
 class _Model:
-    """Cameras of v views, solved for with a number of free intrinsics, and their errors."""
+    """Cameras of v views, solved for with ``free`` free intrinsics, and the errors of these cameras."""
 
     Ks: np.ndarray  # [v,3,3]
     poses: np.ndarray  # [v,4,4] world to camera
@@ -61,7 +61,7 @@ class _Model:
     def criterion(self, far: float) -> float:
         """Compute the Bayesian information criterion, with distances clipped at ``far`` pixels."""
         with np.errstate(invalid="ignore"):
-            smallest_px = 1e-3  # smaller distances count as this, since means have only 24 bits
+            smallest_px = 1e-3  # smaller distances count as smallest_px, since means have only 24 bits
             errors = np.nan_to_num(np.concatenate(self.errors), nan=far).clip(smallest_px, far)
         count = 2.0 * len(errors)
         return count * float(log((errors * errors).mean())) + self.free * float(log(count))
@@ -84,7 +84,7 @@ def calibrate(pairs: Correspondences, width: int, height: int) -> Calibration | 
     model = _choose_model(points, pixels, (width, height), projective_px) if projective_px <= limit_px else None
     if model is None or model.worst_px > limit_px:
         return None
-    # relative uncertainty of the focal length; it is larger if points nearly lie in a plane in front of the camera
+    # relative uncertainty of the focal length, which is large if points nearly lie in a plane in front of the camera
     max_uncertainty = 0.05
     if focal_uncertainty(points, pixels, model.Ks, model.poses) > max_uncertainty:
         return None
@@ -100,7 +100,8 @@ def _choose_model(
 ) -> _Model | None:
     """Choose the simplest intrinsics that explain the pixels; None if the points determine no model.
 
-    ``projective_px`` is the error of the best projective cameras, in pixels.
+    ``points`` and ``pixels`` are ``[n,3]`` and ``[n,2]`` for each view. ``projective_px`` is the error of the best
+    projective cameras, in pixels.
     """
     models: list[_Model] = []
     with suppress(np.linalg.LinAlgError):  # raised at the first model that the points do not determine
@@ -114,8 +115,8 @@ def _solve_models(
 ) -> Iterator[_Model]:
     """Yield models from simple to complex: with intrinsics common to all views, then with intrinsics for each view.
 
-    Models with intrinsics for each view are left out if the error of common intrinsics is as small as the error of the
-    best projective cameras, which is ``projective_px``.
+    Models with intrinsics for each view are left out if the error of common intrinsics is as small as
+    ``projective_px``, the error of the best projective cameras.
     """
     one_focal_models = []
     first_focals = (1.2, 4.8)  # focal lengths, in longer sides of the picture, at which the search begins
@@ -148,10 +149,10 @@ def _solve_models(
 def _fit_model(points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], start: _Model, free: int) -> _Model:
     """Solve for the poses, and for ``free`` intrinsics common to all views, from the cameras of ``start``.
 
-    Raises numpy.linalg.LinAlgError if the points do not determine them.
+    Raises numpy.linalg.LinAlgError if the points do not determine poses and intrinsics.
     """
     K, poses, near_points, near_pixels = start.Ks[0], start.poses, points, pixels
-    rounds = 2  # of solving; the second one leaves out points that are far from their pixels after the first
+    rounds = 2  # rounds of solving; the second leaves out points that are far from their pixels after the first
     for _ in range(rounds):
         K, poses = refine_poses(near_points, near_pixels, K, poses, free=free)
         errors = [projection_errors(p, q, K, pose) for p, q, pose in zip(points, pixels, poses, strict=True)]

@@ -1,8 +1,9 @@
-"""Find the pixels of rows from the rows alone if some pixels have no row; rows are view by view and line by line.
+"""Find the pixels of rows, which are view by view and line by line, from the rows alone if some pixels have no row.
 
 Some lines are complete, for example in the middle of views without borders and far pixels. Where lines are complete,
-the long step back to the left edge repeats once per line. A projective camera is solved from a few such lines. It shows
-the pixels of the lines before and after them, up to the end of the view, even if these lines are incomplete.
+the long step back to the left edge repeats once per line. A projective camera is solved from a few complete lines. This
+camera shows the pixels of the lines before and after the complete lines, up to the end of the view, even if those lines
+are incomplete.
 """
 
 from __future__ import annotations
@@ -20,15 +21,15 @@ from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.reproject import follow_pixels
 
 _MIN_SIDE, _MAX_WIDTH = 16, 2048  # fewest and most pixels of a line
-# A length of lines is tried if at least _MIN_SHARE of the sampled rows show it. At most _MAX_LENGTHS are tried
+# A length of lines is tried if at least _MIN_SHARE of the sampled rows show it. At most _MAX_LENGTHS lengths are tried
 _MIN_SHARE, _MAX_LENGTHS = 0.02, 2
-# The step back to the left edge is at least _WRAP times the usual step. The step from the first point of a line to the
-# first point of the next line is at most _BELOW times the step back
+# The step from the end of a line back to the left edge is at least _WRAP times the usual step. The step from the first
+# point of a line to the first point of the next line is at most _BELOW times the step back to the left edge
 _WRAP, _BELOW = 8.0, 0.25
 _MIN_LINES = 6  # fewest complete lines in a series
 _SOLVED_FROM = 800  # rows of a view that its camera is solved from
 _MAX_PX = 1.0  # largest median distance of a view's rows from their pixels
-# If a camera was solved from n lines, it is used for the next _AHEAD * n lines, or for _MIN_AHEAD if that is more
+# A camera that was solved from n lines is used for the next _AHEAD * n lines, or for _MIN_AHEAD lines if that is more
 _AHEAD, _MIN_AHEAD = 0.3, 2
 _MIN_PLACED = 0.9  # share of the rows that must have a pixel
 
@@ -56,17 +57,14 @@ def find_dropped_grid(means: np.ndarray, valid: np.ndarray) -> tuple[Layout, Cal
 
 
 def _find_line_lengths(points: np.ndarray) -> list[int]:
-    """List the likely lengths of lines, in rows.
-
-    They are the most common distances from a row to its nearest neighbour among later rows.
-    """
+    """List the likely lengths of lines: the commonest numbers of rows from a row to its nearest later neighbour."""
     longest = min(_MAX_WIDTH, len(points) // 4)
     num_samples = 1500  # number of rows whose nearest neighbour is searched among the rows after them
     starts = np.linspace(0, len(points) - longest - 1, num_samples).astype(int)
     x, y, z = points.T.astype(np.float32)
 
     def find_nearest(start: int) -> int:
-        """Return the distance in rows from a row to its nearest neighbour among the next rows, at least _MIN_SIDE."""
+        """Return the distance in rows from a row to its nearest neighbour at least _MIN_SIDE rows later."""
         rows = slice(start + _MIN_SIDE, start + longest)
         dx, dy, dz = x[rows] - x[start], y[rows] - y[start], z[rows] - z[start]
         return _MIN_SIDE + int(np.argmin(dx * dx + dy * dy + dz * dz))
@@ -80,7 +78,7 @@ def _find_line_lengths(points: np.ndarray) -> list[int]:
 
 @dataclass(frozen=True, eq=False)
 class _GridView:
-    """Consecutive rows of one view, with their pixels. Columns and lines are counted from an arbitrary first one."""
+    """Consecutive rows of one view, with their pixels. Columns and lines are counted from any first column and line."""
 
     rows: np.ndarray  # ``[p]`` in order
     x: np.ndarray  # ``[p]`` columns of the pixels
@@ -92,10 +90,10 @@ class _GridView:
 def _find_views(points: np.ndarray, length: int) -> list[_GridView]:
     """Find the views whose lines have ``length`` rows, in the order of their rows.
 
-    Each view is extended from a series of complete lines. Series that fit a camera worse than the best series does are
-    left out.
+    ``points [n,3]`` are the means of all rows. Each view is extended from a series of complete lines. A series that
+    fits its camera worse than the best series fits a camera is left out.
     """
-    num_first, max_series = 12, 200  # the best of the first series counts; at most max_series are used
+    num_first, max_series = 12, 200  # the best of the first num_first series is the measure; at most max_series count
     series = _find_lines(points, length)[:max_series]
     first_views = [_solve_lines(points, starts) for starts in series[:num_first]]
     best_px = min((view.px for view in first_views if view is not None), default=None)
@@ -124,7 +122,7 @@ def _find_lines(points: np.ndarray, length: int) -> list[np.ndarray]:
     usual_steps = np.median(steps[:in_whole_lines].reshape(-1, length), 1).repeat(length)
     usual_steps = np.pad(usual_steps, (0, len(steps) - in_whole_lines), mode="edge")
     rows = np.flatnonzero(steps > _WRAP * usual_steps) + 1
-    max_jumps = 100  # long steps per line; with more, rows are in no order
+    max_jumps = 100  # long steps per line; rows with more long steps are in no order
     if len(rows) * length > max_jumps * len(points):
         return []
     return _collect_series(rows, _link_lines(rows, points[rows], _BELOW * steps[rows - 1], length))
@@ -133,8 +131,8 @@ def _find_lines(points: np.ndarray, length: int) -> list[np.ndarray]:
 def _link_lines(rows: np.ndarray, points: np.ndarray, limits: np.ndarray, length: int) -> np.ndarray:
     """Return for each of ``rows [r]``, which may begin lines, the index ``[r]`` of the line before it; -1 for none.
 
-    The line before begins ``length`` rows earlier. The distance between the first points of both lines, among
-    ``points [r,3]``, is less than ``limits [r]``.
+    The line before begins ``length`` rows earlier. The first points of a line and of the line before, among ``points
+    [r,3]``, are less than ``limits [r]`` apart.
     """
     before, least = np.full(len(rows), -1), limits
     for back in range(1, len(rows)):
@@ -150,10 +148,10 @@ def _link_lines(rows: np.ndarray, points: np.ndarray, limits: np.ndarray, length
 
 
 def _collect_series(rows: np.ndarray, before: np.ndarray) -> list[np.ndarray]:
-    """Collect series of lines that follow each other, the longest series first; no two series share a line.
+    """Collect series of consecutive lines, the longest series first; no line is in two series.
 
-    ``rows [r]`` begin the lines, and ``before [r]`` is the index of the line before, or -1. A series is returned as the
-    rows that begin its lines.
+    ``rows [r]`` begin the lines, and ``before [r]`` is the index of the line before each line, or -1 for none. A series
+    is returned as the rows that begin its lines.
     """
     num_before = np.zeros(len(rows), np.int64)  # number of lines before each line in its series
     for i, previous in enumerate(before.tolist()):
@@ -190,14 +188,14 @@ def _drop_rare_columns(view: _GridView) -> _GridView:
 
 
 def _shift_columns(view: _GridView, columns: int) -> _GridView:
-    """Add a number of columns to the pixels of a view, and change its camera so that it projects there."""
+    """Add a number of columns to the pixels of a view, and change its camera so that it projects to the new pixels."""
     camera = view.camera.copy()
     camera[0] += columns * camera[2]
     return replace(view, x=view.x + columns, camera=camera)
 
 
 def _extend_view(points: np.ndarray, free: np.ndarray, view: _GridView, width: int) -> _GridView:
-    """Extend a view over rows before and after it, as long as its camera shows these in the order of pixels.
+    """Extend a view over rows before and after it, as long as its camera shows these rows in the order of pixels.
 
     ``free [n]`` is True for rows that no other view has. ``width`` is the length of a line in rows.
     """
@@ -228,8 +226,9 @@ def follow_rows(
 ) -> np.ndarray:
     """Find pixels ``[n]`` of rows at ``points [n,3]`` float32 so that most rows are in the order of pixels.
 
-    Rows out of order get -1. The order is view by view and line by line. If ``mixed`` is True, it is line by line, and
-    the rows of one pixel in all views follow each other.
+    The cameras are ``viewmats [v,4,4]`` and ``Ks [v,3,3]``. Rows out of order get the pixel -1. The order of pixels is
+    view by view and line by line. If ``mixed`` is True, the order is line by line, and the rows of one pixel in all
+    views follow each other.
     """
     count, views = len(points), len(viewmats)
     ids = np.empty(count, np.int64)
@@ -245,14 +244,14 @@ def _solve_camera(points: np.ndarray, view: _GridView) -> _GridView:
     pixels = np.stack([view.x[sample], view.y[sample]], 1) + 0.5
     camera, px = projective_camera(points[view.rows[sample]], pixels)
     depths = matmul(points[view.rows[sample]], camera[2, :3]) + camera[2, 3]
-    sign = np.copysign(1.0, np.median(depths))  # with which the points are in front of the camera
+    sign = np.copysign(1.0, np.median(depths))  # sign with which the points are in front of the camera
     return replace(view, camera=camera * sign, px=px)
 
 
 def _make_layout(rows: np.ndarray, views: list[_GridView], count: int) -> Layout:
     """Lay out views on grids of one size, so that all have about the same principal point.
 
-    The layout has ``count`` rows, of which ``rows [m]`` are finite. The rows of a view are numbered among the finite
+    The layout has ``count`` rows, of which ``rows [m]`` are finite. The numbers of a view's rows count only finite
     rows.
     """
     lefts, width = _choose_shifts([view.x for view in views], [_principal_coordinate(view, 0) for view in views])
@@ -267,7 +266,7 @@ def _make_layout(rows: np.ndarray, views: list[_GridView], count: int) -> Layout
 def _choose_shifts(coordinates: Sequence[np.ndarray], middles: Sequence[float]) -> tuple[list[int], int]:
     """Choose the shift of each view along an axis, and the size of the grid along this axis; all in pixels.
 
-    ``coordinates`` has the coordinates of each view's pixels along the axis. ``middles`` has the coordinates of the
+    ``coordinates`` are the coordinates of each view's pixels along the axis. ``middles`` are the coordinates of the
     views' principal points.
     """
     firsts = np.array([pixels.min() for pixels in coordinates])
@@ -284,7 +283,7 @@ def _choose_shifts(coordinates: Sequence[np.ndarray], middles: Sequence[float]) 
 def _principal_coordinate(view: _GridView, axis: int) -> float:
     """Return the coordinate along ``axis`` of the principal point of a view's projective camera, in pixels.
 
-    It follows from the camera's matrix (Hartley and Zisserman 2004, section 6.2).
+    The principal point follows from the camera's matrix (Hartley and Zisserman 2004, section 6.2).
     """
     forward = view.camera[2, :3]
     return float((view.camera[axis, :3] * forward).sum() / (forward * forward).sum())

@@ -14,7 +14,7 @@ from gsmerge.types import Cameras, Gaussians
 
 
 def no_pixels_error(ply: FileInfo, cameras: Cameras) -> SceneError:
-    """Make the SceneError for rows that are not the pixels of the cameras; it states the numbers of both."""
+    """Make the SceneError for rows that are not the pixels of the cameras; the error states both numbers."""
     views, width, height = len(cameras), cameras.width, cameras.height
     expected = f"{views} x {height} x {width} = {views * height * width} (views x height x width)"
     actual = f"{ply.count} in no known order" if ply.count == views * height * width else str(ply.count)
@@ -44,7 +44,7 @@ def refuse_other_cameras(inputs: AlignmentInput, camera_file: CameraFile) -> Non
 def misalignment_error(path: str, alignment: Alignment, reason: str | None) -> SceneError:
     """Make the SceneError for rows that do not lie in the pixels, although there are as many rows as pixels.
 
-    ``reason`` names another order that fits, see :func:`explain_misalignment`; None if no order does.
+    ``reason`` names another order of rows that fits, see :func:`explain_misalignment`; None if no order fits.
     """
     percent = f"{100 * alignment.share_in_front:.0f}"
     in_front = "" if percent == "100" else f" and only {percent} % in front of their camera"
@@ -57,7 +57,7 @@ def misalignment_error(path: str, alignment: Alignment, reason: str | None) -> S
 
 
 def explain_misalignment(gaussians: Gaussians, cameras: Cameras, valid: np.ndarray) -> str | None:
-    """Describe another order, in which the rows would be the pixels of the cameras; None if there is none.
+    """Describe another order, in which the rows would be the pixels of the cameras; None if no order fits.
 
     ``valid [n]`` is True for rows that are visible Gaussians.
     """

@@ -1,8 +1,8 @@
-"""Solve for the frame of the Gaussians: the pose of each view, and the similarity that moves the cameras there.
+"""Solve for the frame of the Gaussians: each view's pose in this frame, and the similarity that moves cameras to it.
 
-If rows are pixels, they determine the pose of each view, because a Gaussian lies on the ray of its pixel. Its mean m
-satisfies ``cross(m - c, d) = 0`` with the camera's centre c and the ray's direction d. The Gaussians stay in place, and
-the cameras are moved.
+Rows that are pixels determine the pose of each view, because a Gaussian lies on the ray of its pixel. The Gaussian's
+mean m satisfies ``cross(m - c, d) = 0`` with the camera's centre c and the ray's direction d. The Gaussians stay in
+place, and the cameras are moved.
 """
 
 from __future__ import annotations
@@ -30,13 +30,14 @@ from gsmerge.values.arrays import distinct
 
 _ROUNDS = 4  # number of rounds of reweighted least squares
 _HALF = np.sqrt(0.5)
-# Rotation of the world by the pixelSplat family. It swaps axes, and then turns by 45 degrees about the last axis
+# Rotation of the world by exporters of the pixelSplat family: axes are swapped, and then turned by 45 degrees about the
+# last axis
 UPRIGHT = np.array([[-_HALF, 0, _HALF], [-_HALF, 0, -_HALF], [0, -1, 0]])
 _VIEWER = np.array([[0.0, 0, -1], [1, 0, 0], [0, -1, 0]])  # rotation of the world by Splatter Image's demo
 
 
 def scale_by(scale: float, note: str = "") -> Similarity:
-    """Return a similarity that only scales. ``note`` is added to its description."""
+    """Return a similarity that only scales. ``note`` is added to the description of the similarity."""
     text = f"positions scaled by {scale:.4g}{note}"
     return Similarity(np.eye(3), scale, np.zeros(3), text)
 
@@ -66,7 +67,8 @@ def exporter_frames(cameras: Cameras, scale: float | None = None) -> list[Simila
 def fit_frame(cameras: Cameras, poses: np.ndarray, scale: float | None) -> Similarity:
     """Fit the similarity that moves cameras to ``poses [c,4,4]``, with a description in words.
 
-    If all cameras stand in one place, they do not determine the scale. Then ``scale`` is used, or 1 if it is None.
+    If all cameras stand in one place, they do not determine the scale, and ``scale`` is used, or 1 if ``scale`` is
+    None.
     """
     frame = fit_similarity(cameras.viewmats, poses, scale or 1.0)
     angle = np.degrees(arccos(np.clip((np.trace(frame.rotation) - 1) / 2, -1, 1)))
@@ -89,11 +91,12 @@ def solve_frame(
 ) -> Similarity | None:
     """Solve robustly for the frame in which rays pass nearest to their ``points [t,3]``.
 
-    Its ``rotation`` is known, so scale and shift are solved for. ``rays_and_centres`` are the two results of
-    :func:`ray_directions`. Returns None if the scale would not be positive.
+    The ``rotation`` of the frame is known, so only scale and shift are solved for. ``rays_and_centres`` are the two
+    results of :func:`ray_directions`. Returns None if the scale would not be positive.
     """
     rays, centres = (matmul(vectors, rotation.T) for vectors in rays_and_centres)
-    # Linear equations of scale and shift: points and centres have the same projections onto the plane across each ray
+    # Linear equations of scale and shift: a point and its camera's centre have one projection onto the plane across the
+    # ray
     projections = np.eye(3) - rays[:, :, None] * rays[:, None, :]
     columns = [transform(projections, centres)[:, :, None], projections]
     A, b = np.concatenate(columns, 2), transform(projections, points)
@@ -114,7 +117,7 @@ def solve_frame(
 
 
 def solve_poses(pairs: Correspondences, Ks: np.ndarray) -> dict[int, np.ndarray]:
-    """Return the pose ``[4,4]`` of each view, solved from its own pixels only; without views where that fails."""
+    """Return the pose ``[4,4]`` of each view, solved from its own pixels only, without views for which that fails."""
     poses = ((int(view), solve_pose(pairs, int(view), Ks[view])) for view in distinct(pairs.views))
     return {view: pose for view, pose in poses if pose is not None}
 
@@ -130,7 +133,7 @@ def solve_pose(pairs: Correspondences, view: int, K: np.ndarray) -> np.ndarray |
     middle = medians(points)
     unit = median(np.abs(points - middle)) or 1.0
     points, K = (points - middle) / unit, K.astype(np.float64)
-    for _ in range(2):  # the second time without points far from their pixels
+    for _ in range(2):  # the second round leaves out points far from their pixels
         start = start_pose(points, pixels, K)
         if start is None:
             return None

@@ -24,7 +24,7 @@ class Grid:
 
     camera_file: CameraFile  # the cameras as they are read, in one convention of the poses
     cameras: Cameras  # the same cameras at the size of the grid
-    transform: PhotoTransform | None  # applied to the photos; None: nothing
+    transform: PhotoTransform | None  # transform of the photos to the grid; None: photos stay as they are
     notes: tuple[str, ...]  # notes for the user, one sentence each
     moves: Sequence[dict[str, Any]] = ()  # how far each camera was moved to its Gaussians; empty if none was moved
     # ``[c,4,4]`` poses as read, to which the Gaussians have to move, because photos confirm these poses; otherwise None
@@ -50,7 +50,7 @@ class PlacedGrid:
         return self.grid.cameras if self.frame is IDENTITY else self.frame.move_cameras(self.grid.cameras)
 
     def notes(self, usual: Convention) -> list[str]:
-        """List notes on what was adapted. ``usual`` is the pose convention of the file's format."""
+        """List notes on what was changed in the cameras. ``usual`` is the pose convention of the file's format."""
         notes, convention = [*self.grid.notes], self.grid.camera_file.convention
         if convention != usual:
             fits = f"the poses fit when read as {describe_convention(convention)}"
@@ -70,8 +70,8 @@ def with_poses(grid: Grid, poses: PosesInConvention) -> Grid:
 def with_photo_size(camera_file: CameraFile, size: Size | None) -> CameraFile:
     """Return cameras with the ``size`` of the photos if the cameras' own size differs from it by one pixel.
 
-    A file may not state the size, so that it was computed as twice the principal point, which is not exact. Other
-    cameras are returned as they are.
+    If a file does not state the size, it was computed as twice the principal point, which is not exact. Cameras whose
+    size differs by more than one pixel, or not at all, are returned as they are.
     """
     stored = sizes_of(camera_file)
     if size is None or len(stored) != 1 or not 0 < max(abs(np.subtract(stored[0], size))) <= 1:
@@ -122,8 +122,9 @@ def _mapped_grid(camera_file: CameraFile, size: Size, file_size: Size, file_tran
 def file_grids(camera_file: CameraFile, size: Size | None) -> list[Grid]:
     """Return a list with the grid at the size of the cameras, if the photos have another ``size``.
 
-    Photos are resized to this grid. But if shapes differ, cameras are cropped to the photos. The list is empty without
-    photos, if sizes are equal, and if photos would be enlarged too much.
+    Photos are resized to the size of the cameras. If photos and cameras differ in shape, cameras are cropped to the
+    photos instead. The list is empty without photos, if photos and cameras have one size, and if photos would be
+    enlarged too much.
     """
     sizes = sizes_of(camera_file)
     if size is None or len(sizes) != 1 or sizes[0] == size or camera_file.photo_map is not None:

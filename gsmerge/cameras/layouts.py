@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 ESTIMATED = "estimated from the grid"  # the `source` of cameras that no file gives
-NO_CAMERAS_USED = "no cameras are used"  # first words of the note on such cameras
+NO_CAMERAS_USED = "no cameras are used"  # first words of the note that cameras are not used
 TRIMS = (8, 4, 2)  # pixels that DepthSplat, ZPressor and ReSplat cut off at every border
 
 
@@ -20,7 +20,8 @@ class Layout:
     height: int
     # "view-major": view by view and line by line. "view-fastest": the rows of one pixel in all views follow each other
     order: str = "view-major"
-    # ``[n]`` the pixel ``(view·H + y)·W + x`` of each row, -1 if it has none; None if the rows are all pixels in order
+    # ``[n]`` the pixel ``(view·H + y)·W + x`` of each row, -1 for a row without one; None if the rows are all pixels in
+    # order
     ids: np.ndarray | None = None
 
     @property
@@ -40,10 +41,7 @@ class Layout:
         return np.arange(count, dtype=np.int32 if count <= np.iinfo(np.int32).max else np.int64)
 
     def sample(self, per_view: int) -> tuple[np.ndarray, np.ndarray]:
-        """Choose about ``per_view`` rows of each view, spread over its columns and lines; return them and their pixels.
-
-        The result is two arrays ``[t]``.
-        """
+        """Choose about ``per_view`` rows of each view, spread over columns and lines; return ``[t]`` rows, pixels."""
         area, parts = self.width * self.height, []
         if self.ids is None:
             pixels = np.arange(0, area, spread_step(-(-area // per_view), self.width))
@@ -57,7 +55,7 @@ class Layout:
 
 
 def spread_step(step: int, width: int) -> int:
-    """Enlarge a sampling step until it is coprime to the width, so that samples spread over all columns."""
+    """Enlarge a sampling step until it is coprime to the width, so that samples are from all columns."""
     step = max(1, step)
     while step > 1 and np.gcd(step, width) > 1:
         step += 1

@@ -1,9 +1,9 @@
 """Read poses in another convention, and move inexact cameras.
 
 Models that predict poses write Gaussians that lie a little beside the pixels of their cameras. The pixels of a view and
-their Gaussians determine its pose, and the cameras are moved to these poses. If photos agree better with the poses as
-read, the Gaussians are wrong. Then the result is marked as ``confirmed``. Views whose photos disagree are moved later
-(``gsmerge/facts/move_poses.py``).
+their Gaussians determine the pose of the view, and its camera is moved to this pose. If photos agree better with the
+poses as read, the Gaussians are wrong, and the result is marked as ``confirmed``. Views whose photos disagree are moved
+later (``gsmerge/facts/move_poses.py``).
 """
 
 from __future__ import annotations
@@ -58,7 +58,8 @@ def describe_convention(convention: Convention) -> str:
 def other_conventions(viewmats: np.ndarray, convention: Convention) -> list[PosesInConvention]:
     """List the poses that a file has if it is read in each other convention than ``convention``.
 
-    In ``convention`` it has the poses ``viewmats [c,4,4]``. Poses that are equal in two conventions are listed once.
+    ``viewmats [c,4,4]`` are the poses of the file in ``convention``. Poses that are equal in two conventions are listed
+    once.
     """
     stored, all_poses = from_viewmats(viewmats, convention), [PosesInConvention(convention, viewmats)]
     tolerance = 1e-6  # tolerance for equal poses, relative to the largest number in them
@@ -76,12 +77,12 @@ class MovedCameras:
 
     cameras: Cameras
     worst_px: float  # largest median distance of a view's Gaussians from their pixels, before the move
-    moves: list[dict[str, Any]]  # of every view, see list_moves; empty if only the principal points were wrong
+    moves: list[dict[str, Any]]  # move of every view, see list_moves; empty if only the principal points were wrong
     confirmed: bool = False  # True if photos confirm the cameras as read, so the Gaussians have to be moved instead
 
     @property
     def note(self) -> str:
-        """Note for the user about the move, one sentence."""
+        """Note for the user on how far cameras were moved, one sentence."""
         if not self.moves:
             x, y = (self.cameras.Ks[:, :2, 2] - (self.cameras.width / 2, self.cameras.height / 2)).mean(0)
             return f"principal points lie ({x:.1f}, {y:.1f}) px from the middle, as the Gaussians' pixels show"
@@ -101,17 +102,17 @@ class MovedCameras:
 def move_cameras(
     pairs: Correspondences, cameras: Cameras, names: tuple[str, ...], source: str = "Ks", images: np.ndarray = NO_IMAGES
 ) -> MovedCameras | None:
-    """Move cameras so that sampled Gaussians project into their pixels; None if a camera is too far off.
+    """Move cameras so that sampled Gaussians project into their pixels; None if a camera is too far from its pixels.
 
     If changed intrinsics fit as well as moved poses, the intrinsics are changed instead. Only principal points in the
-    middle of the image may change, because these were probably just assumed. Any other change raises SceneError, which
-    names ``source``. ``names`` are the names of the views. ``images [c,h,w,3]`` are photos, which may confirm the poses
-    as read. They may be empty.
+    middle of the image may change, because these were probably just assumed. A change of other intrinsics raises
+    SceneError, which names ``source``. ``names`` are the names of the views. ``images [c,h,w,3]`` are photos, which may
+    confirm the poses as read; they may be empty.
     """
     before = check_pairs(pairs, cameras)
     if not before.worst_px <= max_correctable_px(cameras.width, cameras.height):
         return None
-    # each camera that is off is moved to its own Gaussians
+    # each camera that is near_px or more off is moved to its own Gaussians
     viewmats, errors = cameras.viewmats.astype(np.float64), pixel_errors(pairs, cameras)
     near_px = 0.5  # cameras with smaller errors are not moved
     for view in np.unique(pairs.views):
@@ -124,7 +125,7 @@ def move_cameras(
     after = check_pairs(pairs, moved)
     if not after.ok:
         return None
-    # the poses may be right, and the intrinsics wrong
+    # perhaps the poses are right, and the intrinsics wrong
     refitted = _fit_intrinsics(pairs, cameras, after.worst_px)
     if refitted is not None:
         _check_assumed(cameras, refitted, before.worst_px, source)
@@ -137,8 +138,8 @@ def move_cameras(
 def _photos_confirm(pairs: Correspondences, images: np.ndarray, cameras: Cameras, moved: Cameras) -> bool:
     """Return True if photos of the same Gaussians agree better with ``cameras`` than with the ``moved`` cameras.
 
-    The Gaussians lie where the moved cameras show them. To compare, the Gaussians of each view are moved back with its
-    camera.
+    The Gaussians lie where the moved cameras show them. To compare both, the Gaussians of each view are moved back with
+    its camera.
     """
     motions = matmul(invert(cameras.viewmats), moved.viewmats)[pairs.views]
     points = transform(motions[:, :3, :3], pairs.points) + motions[:, :3, 3]
@@ -148,10 +149,10 @@ def _photos_confirm(pairs: Correspondences, images: np.ndarray, cameras: Cameras
 
 
 def _measure_disagreement(points: np.ndarray, pairs: Correspondences, images: np.ndarray, cameras: Cameras) -> float:
-    """Measure the median difference in colour between photos of the same points; inf if no point is in two photos.
+    """Measure the median difference in colour between two photos of the same point; inf if no point is in two photos.
 
-    The first colour of a point is the colour of its pixel in ``pairs``. Other views show the point where it projects
-    from its position in ``points [t,3]``.
+    The first colour of a point is the colour of its pixel in ``pairs``. The other colours of the point are at the
+    pixels of other views to which its position in ``points [t,3]`` projects.
     """
     x, y = pairs.pixels.astype(np.int64).T
     own_colors, errors = photo_colors(images, pairs.views, y, x), []
@@ -185,7 +186,7 @@ def fit_lines(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.
 
 
 def _fit_intrinsics(pairs: Correspondences, cameras: Cameras, moved_px: float) -> Cameras | None:
-    """Scale and shift the intrinsics of all views by the same amounts; None if moved poses fit better.
+    """Scale and shift the intrinsics of all views by the same factors and shifts; None if moved poses fit better.
 
     ``moved_px`` is the largest median error of a view with moved poses, in pixels.
     """
@@ -195,7 +196,7 @@ def _fit_intrinsics(pairs: Correspondences, cameras: Cameras, moved_px: float) -
         xy, depth = project_points(pairs.points[:, None], cameras.viewmats[pairs.views], cameras.Ks[pairs.views])
     in_front = (depth[:, 0] > 0) & np.isfinite(xy[:, 0]).all(1)
     projected, pixels = xy[in_front, 0], pairs.pixels[in_front]
-    # x and y are fitted separately, because a point may fit in x but not in y
+    # x and y have separate fits, because a point may fit in x but not in y
     slopes_and_offsets = [fit_lines(projected[:, [axis]], pixels[:, [axis]])[:2] for axis in range(2)]
     factors, shifts = np.array(slopes_and_offsets)[:, :, 0].T
     Ks = cameras.Ks * np.array([*factors, 1])[:, None]
@@ -209,7 +210,7 @@ def _check_assumed(cameras: Cameras, refitted: Cameras, before_px: float, source
     """Raise SceneError unless ``refitted`` differs from ``cameras`` only in principal points that were just assumed.
 
     Principal points count as assumed if all are in the middle of the image. ``before_px`` is the median error of
-    ``cameras``, in pixels.
+    ``cameras``, in pixels. ``source`` names the intrinsics in the error.
     """
     factors = refitted.Ks[0, (0, 1), (0, 1)] / cameras.Ks[0, (0, 1), (0, 1)]
     middle = cameras.width / 2, cameras.height / 2

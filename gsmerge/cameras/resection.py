@@ -22,8 +22,8 @@ _PoseFit = tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray, float]]
 def start_pose(points: np.ndarray, pixels: np.ndarray, K: np.ndarray) -> np.ndarray | None:
     """Solve for the pose ``[4,4]``, world to camera, that shows points ``[n,3]`` at ``pixels [n,2]``; None on failure.
 
-    The solution of SQPnP (Terzakis and Lourakis 2020) is close to the optimum. At least three points are needed, and
-    they should lie near the origin.
+    ``K [3,3]`` are the intrinsics. The solution of SQPnP (Terzakis and Lourakis 2020) is close to the optimum. At least
+    three points are needed. Points should lie near the origin.
     """
     try:
         solved, rotation, shift = cv2.solvePnP(points, pixels, K, None, flags=cv2.SOLVEPNP_SQPNP)
@@ -44,9 +44,9 @@ def refine_poses(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Refine poses by least squares so that points ``[n,3]`` of each view project to their ``pixels [n,2]``.
 
-    ``free`` is the number of intrinsics that are also solved for: 0, ONE_FOCAL, TWO_FOCALS or ALL_INTRINSICS. They are
-    common to all views. Returns intrinsics ``[3,3]`` and poses ``[v,4,4]``. Raises numpy.linalg.LinAlgError if the
-    points do not determine them.
+    The search begins at ``K [3,3]`` and ``poses [v,4,4]``. ``free`` is the number of intrinsics that are also solved
+    for: 0, ONE_FOCAL, TWO_FOCALS or ALL_INTRINSICS. Intrinsics are common to all views. Returns intrinsics ``[3,3]``
+    and poses ``[v,4,4]``. Raises numpy.linalg.LinAlgError if the points do not determine poses and intrinsics.
     """
 
     def linearise(new_K: np.ndarray, new_poses: np.ndarray) -> _PoseFit:
@@ -68,8 +68,8 @@ def _linearise(
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Return Gauss-Newton's curvature ``[v,6+f,6+f]`` and slope ``[v,6+f]`` of the squared error, and this error.
 
-    The first 6 parameters are rotation and shift of a view's camera. The f = ``free`` parameters after them are
-    logarithms of focal lengths, and then the principal point.
+    The cameras are ``K [3,3]`` and ``poses [v,4,4]``. The first 6 parameters are rotation and shift of a view's camera.
+    The other f = ``free`` parameters are logarithms of focal lengths, and then the principal point.
     """
     size = 6 + free
     curvature, slope, error = np.empty((len(poses), size, size)), np.empty((len(poses), size)), 0.0
@@ -84,7 +84,10 @@ def _linearise(
 
 
 def _solve_normal_equations(curvature: np.ndarray, slope: np.ndarray, damping: float) -> tuple[np.ndarray, np.ndarray]:
-    """Solve for the changes ``[f]`` of the common intrinsics and the motions ``[v,6]`` of the cameras."""
+    """Solve for the changes ``[f]`` of the common intrinsics and the motions ``[v,6]`` of the cameras.
+
+    ``curvature`` and ``slope`` are results of :func:`_linearise`.
+    """
     size = curvature.shape[1]
     damped = curvature + damping * np.eye(size) * curvature
     pose_slope, mixed = slope[:, :6, None], damped[:, :6, 6:]
@@ -104,7 +107,7 @@ def _change_intrinsics(K: np.ndarray, change: np.ndarray) -> np.ndarray:
     """Return intrinsics changed by the parameters ``change [f]`` of :func:`_linearise`."""
     K = K.copy()
     if len(change):
-        K[(0, 1), (0, 1)] *= 1 + change[:TWO_FOCALS]  # a single change counts for both focal lengths
+        K[(0, 1), (0, 1)] *= 1 + change[:TWO_FOCALS]  # if one focal length is free, its change counts for both
         K[:2, 2] += change[TWO_FOCALS:] if len(change) == ALL_INTRINSICS else 0
     return K
 
@@ -114,7 +117,8 @@ def focal_uncertainty(
 ) -> float:
     """Estimate the relative standard error of one focal length for all views, if pixels have an error of 1 pixel.
 
-    Each view has ``points [n,3]`` and their ``pixels [n,2]``. The result is inf for points in a plane.
+    Each view has ``points [n,3]``, their ``pixels [n,2]``, and a camera ``Ks [3,3]``, ``poses [4,4]``. The result is
+    inf for points in a plane.
     """
     information = 0.0  # inverse of the squared error
     for view_points, view_pixels, K, pose in zip(points, pixels, Ks, poses, strict=True):
@@ -130,7 +134,7 @@ def focal_uncertainty(
 def projective_error(points: np.ndarray, pixels: np.ndarray) -> float:
     """Measure the median distance of points ``[n,3]`` from ``pixels [n,2]`` under the best projective camera, pixels.
 
-    Returns 0 if there are too few points to decide.
+    Returns 0 for fewer points than a camera can be tested on.
     """
     min_points = 24  # with fewer points almost any projective camera fits
     return 0.0 if len(points) < min_points else projective_camera(points, pixels)[1]
@@ -139,8 +143,9 @@ def projective_error(points: np.ndarray, pixels: np.ndarray) -> float:
 def projective_camera(points: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, float]:
     """Solve for the projective camera ``[3,4]`` that shows points ``[n,3]`` nearest to their ``pixels [n,2]``.
 
-    A projective camera is any ``[3,4]`` matrix. It is solved for by the direct linear transform with reweighting
-    (Hartley and Zisserman 2004, section 7.1). Also returns the median distance of the points from their pixels.
+    A projective camera is any ``[3,4]`` matrix. The matrix is solved for by the direct linear transform with
+    reweighting (Hartley and Zisserman 2004, section 7.1). Also returns the median distance of the points from their
+    pixels.
     """
     middle = medians(points)
     unit = median(np.abs(points - middle)) or 1.0
@@ -148,7 +153,7 @@ def projective_camera(points: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarra
     centre, size = pixels.mean(0), float(pixels.std()) or 1.0
     targets = (pixels - centre) / size
     zero = np.zeros_like(local)
-    # two linear equations of the camera for each point; they hold if the point projects to x, and to y, of its pixel
+    # for each point two linear equations of the camera, which hold if it projects to x, and to y, of its pixel
     of_x = np.concatenate([local, zero, -targets[:, :1] * local], 1)
     of_y = np.concatenate([zero, local, -targets[:, 1:] * local], 1)
     weights = np.ones(len(points))
@@ -179,7 +184,8 @@ def _whiten(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     homogeneous = np.concatenate([points, np.ones((len(points), 1))], 1)
     homogeneous /= np.linalg.norm(homogeneous, axis=1, keepdims=True)
     values, axes = eigh(matmul(homogeneous.T, homogeneous))
-    # if the second moment along an axis is below this share of the largest, the points lie in a plane across the axis
+    # points lie in a plane across an axis if the second moment along it is below this share of the largest second
+    # moment
     flatness = 1e-10
     used = values > flatness * values[-1]  # points in a plane or on a line do not determine the other axes
     basis = axes[:, used] / np.sqrt(values[used])

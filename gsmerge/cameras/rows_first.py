@@ -1,8 +1,9 @@
 """Find the cameras that show the Gaussians of a file in place, and the pixel of each row if rows are pixels in order.
 
-Rows in plain order determine the pose of each view. They are recognised if one similarity moves the file's cameras to
-these poses. If some pixels may have no row, the rows are followed through the pixels, in each frame that exporters use.
-Other rows have no pixels, and only their cameras are chosen, by the colours of the photos.
+Rows in plain order determine the pose of each view. Plain order is recognised if one similarity moves the file's
+cameras to the poses that rows determine. If some pixels may have no row, the rows are followed through the pixels, in
+each frame that exporters use. Rows in another order have no pixels, and only cameras are chosen for these rows, by the
+colours of the photos.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ from gsmerge.runtime.memory import free_pages
 from gsmerge.types import Cameras
 
 _EVIDENCE = "Gaussians' places in their pixels"  # what shows that a frame is right, in words
-_PLAIN_PX = 0.5  # if rows in order are nearer to their pixels than this, in pixels, no other cameras are tried
+_PLAIN_PX = 0.5  # if rows in plain order are nearer to their pixels than this, in pixels, no other cameras are tried
 _MOST_PLACES = 1 << 27  # largest number of rows times views for which rows are followed; each takes four bytes
 
 
@@ -72,7 +73,7 @@ class RowSource:
         return estimate_cameras(Path(self.ply.info.path), self.ply.gaussians.means, self.ply.valid)
 
     def inputs(self, grid: Grid, *, photos: bool = True) -> AlignmentInput:
-        """Return rows, cameras and photos at the size of a grid. If ``photos`` is False, photos are left out."""
+        """Return rows, cameras and photos at the size of a grid; without photos if ``photos`` is False."""
         images = NO_IMAGES
         if photos:
             images = self.images if grid.transform is None else as_floats(grid.transform.photos(self.photos))
@@ -89,26 +90,27 @@ class Recovery:
 
     @property
     def frame(self) -> Similarity:
-        """The similarity from the frame of the cameras to the frame of the Gaussians."""
+        """Similarity from the frame of the cameras to the frame of the Gaussians."""
         return self.place.frame
 
     @property
     def description(self) -> str:
-        """Description of the rows and the frame in words."""
+        """Description, in words, of the rows' order and of the frame."""
         words = ", ".join(filter(None, (self.layout.description, self.frame.description)))
         return f"{words}: median {self.alignment.middle_px:.2f} px from the pixels"
 
 
 @dataclass(frozen=True, eq=False)
 class AlignmentResult:
-    """Result of :func:`align`: the pixel of every row if rows have pixels, and the cameras that see them."""
+    """Result of :func:`align`: the pixel of every row if rows have pixels, and the cameras that see the Gaussians."""
 
-    # ``[n]`` int64, the pixel ``(view·H + y)·W + x`` of each row, -1 for a row without a pixel; None if no row has one
+    # ``[n]`` int64, the pixel ``(view·H + y)·W + x`` of each row, -1 for a row without a pixel; None if no row has a
+    # pixel
     pixel_ids: np.ndarray | None
     cameras: Cameras  # all c views, in the frame of the Gaussians, at the size of the grid
     images: np.ndarray  # ``[c,h,w,3]`` photos of that size, sRGB in [0, 1], float32; [0,...] without any
     camera_file: CameraFile | None  # in the chosen convention and frame; None without cameras
-    notes: tuple[str, ...] = ()  # what was adapted, one sentence each
+    notes: tuple[str, ...] = ()  # notes on what was adapted, one sentence each
     transform: PhotoTransform | None = None  # applied to the photos
     recovery: Recovery | None = None  # where the pixels of the rows lie; None without pixels
     moves: Sequence[dict[str, Any]] = ()  # how far each camera was moved to its Gaussians; empty if none was moved
@@ -116,7 +118,7 @@ class AlignmentResult:
     # otherwise None
     confirmed_viewmats: np.ndarray | None = None
     problem: str | None = None  # why the rows have no pixels; None if they have
-    # Number of views of the grid that the rows form alone, if the rows are not the pixels of these cameras; otherwise 0
+    # Number of views of the grid that the rows form by themselves, if they are no pixels of ``cameras``; else 0
     own_views: int = 0
 
 
@@ -131,7 +133,8 @@ def align(
 ) -> AlignmentResult:
     """Find the pixel of every row if rows are pixels in order; for other rows, choose the cameras that see them.
 
-    Also finds the size of the grid, the frame and convention of the poses, and the transform of the photos.
+    The function also finds the size of the grid, the frame and convention of the poses, and the transform of the
+    photos.
 
     Args:
         ply: The file's rows.
@@ -139,11 +142,11 @@ def align(
         photos: c uint8 photos of one size, or none.
         order: The order of the rows if it is known, see :class:`gsmerge.settings.reading.ReadHints`.
         scale: Length of one unit of the cameras' world in the world of the Gaussians, if it is given.
-        frames: Reads the frames that a file gives for the cameras; used only for rows without pixels.
+        frames: Reads the frames that a file gives for the cameras. Only called for rows without pixels.
 
     Raises:
-        SceneError: If sizes do not agree, if no cameras see the Gaussians, or if the rows are the pixels of other
-            cameras.
+        SceneError: If photos and cameras do not agree in size, if no cameras see the Gaussians, or if the rows are the
+            pixels of other cameras.
     """
     camera_file = with_photo_size(camera_file, photo_size(photos))
     source = RowSource(ply, camera_file, photos, order, scale)
@@ -181,7 +184,7 @@ def _recover_pixels(source: RowSource, grid: Grid) -> Recovery | None:
     else:  # several Gaussians of a pixel follow each other, or there are several layers of all pixels
         rows = np.arange(count)
         layouts = [replace(layout, ids=ids) for ids in (rows // layers, rows % num_pixels)]
-    # at least min_rows have to be finite, or min_share of all rows if that is less
+    # at least min_rows rows have to be finite, or the share min_share of all rows if that is less
     min_rows, min_share = 24, 0.05
     if int(source.ply.valid.sum()) < min(min_rows, min_share * count):
         return None
@@ -189,17 +192,17 @@ def _recover_pixels(source: RowSource, grid: Grid) -> Recovery | None:
 
 
 def _place_layout(source: RowSource, grid: Grid, layout: Layout) -> Recovery | None:
-    """Find cameras under which rows lie in the pixels of a layout; None if there are none.
+    """Find cameras under which rows lie in the pixels of a layout; None if no cameras fit.
 
-    The cameras of the grid are tried as stored, and then in another frame or convention. At last each camera is moved
-    to its rows.
+    The cameras of the grid are tried as stored, and then in another frame or convention. If none fits, each camera is
+    moved to its rows.
     """
     inputs = source.inputs(grid, photos=False)
     pairs = inputs.pairs(layout)
     shuffled = replace(pairs, pixels=np.random.default_rng(0).permutation(pairs.pixels))
 
     def accept(grid: Grid, frame: Similarity, limit: float) -> Recovery | None:
-        """Return the result for a frame; None if rows do not lie in their pixels.
+        """Return the result for cameras in a frame; None if rows do not lie in their pixels.
 
         ``limit`` is the largest median distance of a view's rows from their pixels.
         """
@@ -207,7 +210,7 @@ def _place_layout(source: RowSource, grid: Grid, layout: Layout) -> Recovery | N
         alignment = check_pairs(pairs, cameras)
         far_px = SHUFFLED_MARGIN * max(alignment.worst_px, AS_NEAR_PX)
         is_near = pixel_errors(pairs, cameras) <= max_correctable_px(*grid.size)
-        min_share = 0.75  # least share of rows near their pixels; with less, one of two layers belongs to other views
+        min_share = 0.75  # least share of rows near their pixels; below it, one of two layers belongs to other views
         rows_lie_in_pixels = (
             alignment.ok
             and alignment.worst_px <= limit
@@ -242,8 +245,8 @@ def _list_conventions(source: RowSource, grid: Grid) -> Iterator[Grid]:
 def _move_to_rows(source: RowSource, grid: Grid, layout: Layout) -> Grid:
     """Return a grid whose inexact cameras are moved to show rows in their pixels.
 
-    If the cameras are too far off, the same grid is returned. If photos confirm the poses as read, the new grid has
-    these poses as ``confirmed_viewmats``.
+    If the cameras are too far from their pixels, the grid is returned unchanged. If photos confirm the poses as read,
+    the new grid has the poses as read as ``confirmed_viewmats``.
     """
     inputs = source.inputs(grid, photos=False)
     moved_gaussians = 2000  # Gaussians of a view that its moved pose is solved from
@@ -291,10 +294,10 @@ def _list_frames(source: RowSource, grid: Grid) -> Iterator[Similarity]:
 
 
 def _follow_pixels(points: np.ndarray, cameras: Cameras, *, mixed: bool) -> np.ndarray | None:
-    """Find the pixels ``[n]`` of rows in the order of the pixels; None for rows in another order.
+    """Find the pixels ``[n]`` of rows, at ``points [n,3]``, in the order of the pixels; None for rows in another order.
 
-    A few rows may have no pixel, which is -1. If ``mixed`` is True, the rows of one pixel in all views follow each
-    other.
+    A few rows may have no pixel; their result is -1. If ``mixed`` is True, the rows of one pixel in all views follow
+    each other.
     """
     matrices = np.ascontiguousarray(cameras.viewmats, np.float64), np.ascontiguousarray(cameras.Ks, np.float64)
     ids = None
@@ -313,7 +316,7 @@ def _follow_pixels(points: np.ndarray, cameras: Cameras, *, mixed: bool) -> np.n
 def _align_without_pixels(source: RowSource, grid: Grid, frames: Callable[[], Sequence[Similarity]]) -> AlignmentResult:
     """Choose the cameras that see rows for which no pixels were found.
 
-    Raises SceneError if no cameras see them, or if the rows turn out to be pixels of other cameras.
+    Raises SceneError if no cameras see the rows, or if the rows turn out to be pixels of other cameras.
     """
     from gsmerge.cameras.explain import no_pixels_error, refuse_other_cameras
     from gsmerge.cameras.unaligned import choose_cameras

@@ -16,12 +16,12 @@ from gsmerge.types import Cameras, Gaussians, Scene
 
 SHUFFLED_MARGIN = 5.0  # factor by which Gaussians must be nearer to their pixels than to shuffled pixels
 # Two medians of some 400 distances differ by chance. The median of n distances in a plane has a relative standard error
-# of 0.72 / sqrt(n), so the ratio of two medians has one of 5 %, and 1.15 is three standard errors. Files round the
-# numbers of cameras, which displaces projections by up to 0.02 pixels
+# of 0.72 / sqrt(n), so the ratio of two medians has a standard error of 5 %, and 1.15 is three standard errors. Files
+# round the numbers of cameras, which displaces projections by up to 0.02 pixels
 AS_NEAR, AS_NEAR_PX = 1.15, 0.02
 SCORED_GAUSSIANS, MIN_SCORED_GAUSSIANS = 6000, 60  # Gaussians of a score: in all views, and at least in each view
 MAX_CHECKED = 5_000  # pixels per view that an alignment is checked on
-# Moving a camera may correct an error of up to MAX_PX pixels, and of up to MAX_SHARE of the image's side
+# Moving a camera may correct an error of up to MAX_PX pixels and up to the share MAX_SHARE of the image's side
 MAX_PX, MAX_SHARE = 12.0, 0.05
 MAX_MEDIAN_PX = 1.5  # networks move a Gaussian within its pixel, and some of them a little beyond
 
@@ -62,7 +62,7 @@ class AlignmentInput:
     def pairs(self, layout: Layout, per_view: int = 0) -> Correspondences:
         """Return about ``per_view`` valid rows of each view of a layout, with their pixels and views.
 
-        If ``per_view`` is 0, as many rows are returned as a score needs.
+        If ``per_view`` is 0, the number of rows that a score needs is returned.
         """
         per_view = per_view or max(MIN_SCORED_GAUSSIANS, SCORED_GAUSSIANS // layout.views)
         return find_correspondences(self.gaussians.means, self.valid, layout, per_view)
@@ -82,7 +82,7 @@ def find_correspondences(means: np.ndarray, valid: np.ndarray, layout: Layout, p
 
 @dataclass(frozen=True)
 class Alignment:
-    """Distance of projected Gaussians from their pixels, in each view."""
+    """Distances of projected Gaussians from their pixels, in each view."""
 
     # median distance from the pixel centre, pixels; inf if most Gaussians are behind the camera, NaN if none is finite
     median_px: tuple[float, ...]
@@ -94,7 +94,7 @@ class Alignment:
 
     @property
     def middle_px(self) -> float:
-        """Median over the views, of their median distances in pixels."""
+        """Median over the views of a view's median distance, in pixels."""
         return float(lower_median(np.array([px for px in self.median_px if not math.isnan(px)] or [math.inf])))
 
     @property
@@ -104,7 +104,7 @@ class Alignment:
 
 
 def is_as_near(px: float, least: float) -> bool:
-    """Return True if a median distance is as small as the ``least`` one, apart from chance and rounding; in pixels."""
+    """Return True if a median distance in pixels is as small as ``least``, apart from chance and rounding."""
     return px <= max(AS_NEAR * least, least + AS_NEAR_PX)
 
 
@@ -114,12 +114,12 @@ def pixel_limit(width: int, height: int) -> float:
 
 
 def max_correctable_px(width: int, height: int) -> float:
-    """Return the largest median error, in pixels, that moving a camera may correct."""
+    """Return the largest median error, in pixels, that the move of a camera may correct."""
     return max(pixel_limit(width, height), min(MAX_PX, MAX_SHARE * math.sqrt(width * height)))
 
 
 def photo_colors(images: np.ndarray, views: np.ndarray, y: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Look up the colours ``[t,3]`` of photos ``[c,h,w,3]`` at the given pixels; NaN without photos."""
+    """Look up the colours ``[t,3]`` of photos ``[c,h,w,3]`` at places ``x``, ``y`` in ``views``; NaN without photos."""
     return gather(images, views, y, x) if len(images) else np.full((len(x), 3), np.nan, np.float32)
 
 
@@ -127,7 +127,7 @@ def sample_pixels(gaussians: Gaussians, cameras: Cameras, valid: np.ndarray) -> 
     """Return the sample of Gaussians and pixels that :func:`check_pairs` measures.
 
     ``gaussians`` are V·H·W rows, view by view and line by line. Rows that are False in ``valid [V·H·W]`` (or
-    ``[V,H,W]``) are left out. Raises ValueError for another number of rows.
+    ``[V,H,W]``) are left out. Raises ValueError if there are not V·H·W rows.
     """
     layout = Layout(len(cameras), cameras.width, cameras.height)
     if len(gaussians) != len(cameras) * cameras.height * cameras.width:
@@ -161,7 +161,7 @@ def check_pairs(pairs: Correspondences, cameras: Cameras) -> Alignment:
         for view_errors in np.split(errors, ends[:-1])
     )
     count = max(1, len(errors))
-    # points behind their camera have an infinite error, so all finite errors are in front
+    # points behind their camera have an infinite error, so all points with finite errors are in front
     limits = sys.float_info.max, 1, max_correctable_px(cameras.width, cameras.height)
     in_front, within_1px, near = (float((errors <= px).sum()) / count for px in limits)
     is_near = [median_px < limit for median_px in medians if not math.isnan(median_px)]

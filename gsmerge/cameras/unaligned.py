@@ -21,26 +21,27 @@ from gsmerge.types import Cameras, Gaussians
 
 # Colour error, divided by the colour error of shuffled pixels, above which colours agree no better than at random
 RANDOM_SHARE = 0.85
-# Least score of another convention, divided by the score of the usual one. _MARGIN is for scores without colours
+# Least score of another convention, divided by the score of the usual convention: _MARGIN if colours are not compared,
+# _COLOR_MARGIN if they are
 _COLOR_MARGIN, _MARGIN = 1.3, 2.0
 _FRAME_GAIN = 1.1  # least score of another frame, divided by the score of the cameras as they are
 _SEEN_GAUSSIANS = 20_000  # number of Gaussians that are projected, to estimate the share that cameras see
-# Gaussians that are compared in other conventions and frames. So many give scores an error of 0.4 %, while the scores
-# of two frames have to differ by 5 % or more
+# Gaussians that are compared in other conventions and frames. With this many Gaussians, scores have an error of 0.4 %,
+# while the scores of two frames have to differ by 5 % or more
 _COMPARED_GAUSSIANS = 5000
-MAX_FRONT_RATIO = 0.5  # as RANDOM_SHARE, but for only the foremost Gaussians in a frame chosen by colours
+MAX_FRONT_RATIO = 0.5  # like RANDOM_SHARE, but only for the foremost Gaussians, in a frame that was chosen by colours
 # A Gaussian is foremost up to _FRONT times the least depth in its cell. A cell has _PER_CELL Gaussians on average
 _FRONT, _PER_CELL = 1.05, 3
 # Scales of the cameras' positions, all of which are tried. Programs that write cameras and Gaussians use units that
 # differ by factors of up to 1000
 _SCALES = np.geomspace(1 / 1300, 1300, 115)
-# Finer searches around the best scale: largest change (natural logarithm), number of scales, and number of Gaussians
+# For each finer search around the best scale: largest change (natural logarithm), number of scales, number of Gaussians
 _FINER = ((0.1, 11, 2000), (0.015, 7, 20_000), (0.004, 5, 20_000))
 # Places in a picture at which the middle of the Gaussians is tried, to find a shift. A place is x in widths of the
-# picture, y in heights, and the logarithm of the depth in radii of the scene. Over a step of a tenth of a picture,
-# colours still agree
+# picture, y in heights, and the logarithm of the depth in radii of the scene. The places are a tenth of a picture
+# apart, because colours still agree over this distance
 _PLACES = tuple(np.linspace(*ends).tolist() for ends in ((-0.2, 1.2, 15), (-0.2, 1.2, 15), (-1.5, 2.25, 16)))
-# Finer searches around the best places: number of Gaussians, number of places that are kept, and size of a step
+# For each finer search around the best places: number of Gaussians, number of places that are kept, size of a step
 _SHIFT_STEPS = [(2000 if i < 5 else 20_000, 8 if i < 5 else 1, 0.05 * 0.6**i) for i in range(10)]
 
 
@@ -58,7 +59,7 @@ class CameraCheck:
 
     @property
     def score(self) -> float:
-        """Score in [0, 1] to rank cameras. It is the share seen; if colours are known, times 1 minus their ratio."""
+        """Score in [0, 1] to rank cameras: the share seen, times 1 minus the colour ratio if it is known."""
         return self.share_seen * (1.0 if np.isnan(self.color_ratio) else max(0.0, 1 - self.color_ratio))
 
     @property
@@ -86,7 +87,7 @@ def check_cameras(
     colours of hidden Gaussians do not count. ``hiding`` are further points ``[m,3]`` that hide Gaussians, but have no
     colours themselves.
     """
-    # fewer Gaussians are measured if there are so many cameras that more than max_projected points would be projected
+    # fewer Gaussians are measured if otherwise more than max_projected points would be projected into all cameras
     min_gaussians, max_projected = 200, 4_000_000
     samples = min(samples, max(min_gaussians, max_projected // len(cameras)))
     rows = np.flatnonzero(valid)
@@ -111,7 +112,7 @@ def check_cameras(
             column, row = xy[view, seen].astype(np.int64).T
             if foremost:
                 is_front = _find_foremost(column, row, depth[view, seen], cameras.width * cameras.height)
-                is_front &= seen < len(rows)  # the other points only hide
+                is_front &= seen < len(rows)  # the points ``hiding`` have no colours
                 seen, column, row = seen[is_front], column[is_front], row[is_front]
             photo = photo_colors(images, np.full(len(seen), first_view + view), row, column)
             if (photo == photo[:1]).all():  # a view without a photo is black
@@ -126,7 +127,7 @@ def check_cameras(
 
 
 def _color_ratio(errors: list[np.ndarray], shuffled: list[np.ndarray], count: int) -> tuple[float, float]:
-    """Divide the mean error by the mean error of shuffled pixels; also return the standard error of the ratio.
+    """Divide the mean colour error by the mean colour error of shuffled pixels; also return the ratio's standard error.
 
     ``count`` is the number of Gaussians. Both results are NaN if the colours hardly vary.
     """
@@ -139,16 +140,16 @@ def _color_ratio(errors: list[np.ndarray], shuffled: list[np.ndarray], count: in
 
 
 def _mean_difference(colors: np.ndarray, other_colors: np.ndarray) -> np.ndarray:
-    """Return the mean absolute difference ``[n]`` over the channels of colours ``[n,3]``."""
+    """Return the mean absolute difference ``[n]``, over the channels, of two arrays of colours ``[n,3]``."""
     red, green, blue = np.abs(colors - other_colors).T
     return np.asarray((red + green + blue) / 3)
 
 
 def _find_foremost(column: np.ndarray, row: np.ndarray, depth: np.ndarray, area: int) -> np.ndarray:
-    """Return a mask ``[n]`` of the points that are about as near as the nearest point of their cell.
+    """Return a mask ``[n]`` of the points that are about as near to the camera as the nearest point of their cell.
 
     ``column [n]`` and ``row [n]`` are the pixels of the points, and ``depth [n]`` their depths. A cell is a square of
-    pixels. The picture has ``area`` pixels, and cells are so large that each has a few points.
+    pixels, and so large that it has a few points. The picture has ``area`` pixels.
     """
     if not len(row):
         return np.zeros(0, bool)
@@ -165,11 +166,12 @@ def choose_poses(
 ) -> tuple[PosesInConvention | None, CameraCheck, str | None]:
     """Choose the pose convention in which the cameras see most Gaussians and the colours fit best.
 
-    ``cameras`` are in the usual ``convention``. The other arguments are those of :func:`check_cameras`. Returns:
+    ``cameras`` are in the usual ``convention``. ``gaussians``, ``valid`` and ``images`` are as in
+    :func:`check_cameras`. Returns:
 
-    - the poses in another convention; None if no other convention is clearly better than the usual one
+    - the poses in another convention; None if no other convention is clearly better than the usual convention
     - the check of the chosen poses
-    - a note that another convention fits the photos as well; None if no other convention does
+    - a note that another convention fits the photos as well; None if no other convention fits
     """
     usual = check_cameras(gaussians, valid, cameras, images)
     candidates = [
@@ -184,7 +186,7 @@ def choose_poses(
     margin = _MARGIN if np.isnan(best.color_ratio) else _COLOR_MARGIN
     if best.score >= margin * max((check.score for check in rivals if check.ok), default=0.0):
         return poses, best, None
-    # Without photos other conventions may see as many Gaussians of any scene, so no note is needed
+    # Without photos there is no note, because in any scene another convention may see as many Gaussians
     as_good = usual.ok and usual.num_compared > 0 and _FRAME_GAIN * best.score >= usual.score
     note = f"the poses fit as well when read as {poses.description}; they are read as the format has them"
     return None, usual, note if as_good else None
@@ -197,7 +199,7 @@ def choose_cameras(
 
     ``frames`` are the frames that a file gives, which are tried first. The usual frames of exporters are tried next.
     Returns the grid with these cameras, and notes. The error ``no_pixels`` explains why the rows have no pixels. If no
-    cameras see the Gaussians, it is raised, and also says what was tried.
+    cameras see the Gaussians, ``no_pixels`` is raised, with a sentence on what was tried.
     """
     rows, unchanged = (inputs.gaussians, inputs.valid), PlacedGrid(grid, IDENTITY)
     if frames:
@@ -242,16 +244,16 @@ def _check_colors(inputs: AlignmentInput, cameras: Cameras, name: str, no_pixels
 def _choose_frame(inputs: AlignmentInput, usual: CameraCheck) -> Similarity | None:
     """Choose a frame in which the colours fit the photos clearly better than in the frame of the cameras.
 
-    Returns None if there is no such frame. The frames of exporters are tried. ``usual`` is the check of the cameras as
-    they are. Colours fit best at the true scale, so the chosen frame must fit better than the same frame at nearby
-    scales. If no frame does at the scale of the cameras, the scale is solved for.
+    Returns None if no frame fits clearly better. The frames of exporters are tried. ``usual`` is the check of the
+    cameras as they are. Colours fit best at the true scale, so the chosen frame must fit better than the same frame at
+    nearby scales. If no frame stands out at the scale of the cameras, the scale is solved for.
     """
     if not len(inputs.images):
         return None
     frames = exporter_frames(inputs.cameras)
     best, score = _best_frame(inputs, frames)
     stands_out = _stands_out(inputs, best, score)
-    # views without a photo are black; a single photo fits somewhere in any scene
+    # views without a photo are black and do not count; one photo is too few, because it fits somewhere in any scene
     if inputs.scale is None and not stands_out and inputs.images.any((1, 2, 3)).sum() > 1:
         # frames of `exporter_frames`: rotated into the first camera, turned to y up, and moved into the first camera
         solved = [_solve_scale(inputs, frame) for frame in (IDENTITY, frames[1], frames[4], frames[-1])]
@@ -264,8 +266,11 @@ def _choose_frame(inputs: AlignmentInput, usual: CameraCheck) -> Similarity | No
 
 
 def _score_frame(inputs: AlignmentInput, frame: Similarity, samples: int = _COMPARED_GAUSSIANS) -> float:
-    """Return the score of the cameras in a frame, see :class:`CameraCheck`; 0 if colours cannot be compared."""
-    # the first camera is left out, because it may see all Gaussians at any scale
+    """Return the score of the cameras in a frame, see :class:`CameraCheck`; 0 if colours cannot be compared.
+
+    ``samples`` is the number of Gaussians that are compared.
+    """
+    # the first camera does not count, because it may see all Gaussians at any scale
     later = slice(1 if len(inputs.cameras) > 1 else 0, None)
     cameras = frame.move_cameras(inputs.cameras)[later]
     check = check_cameras(inputs.gaussians, inputs.valid, cameras, inputs.images[later], samples)
@@ -275,7 +280,7 @@ def _score_frame(inputs: AlignmentInput, frame: Similarity, samples: int = _COMP
 def _best_frame(
     inputs: AlignmentInput, frames: Iterable[Similarity], samples: int = _COMPARED_GAUSSIANS
 ) -> tuple[Similarity, float]:
-    """Return the first frame with the highest score, and this score."""
+    """Return the frame with the highest score, the first of several, and this score."""
     scored = ((frame, _score_frame(inputs, frame, samples)) for frame in frames)
     return max(scored, key=lambda frame_and_score: frame_and_score[1])
 
@@ -300,9 +305,9 @@ def _scale_frame(frame: Similarity, factor: float) -> Similarity:
 def _solve_scale(inputs: AlignmentInput, frame: Similarity) -> Similarity:
     """Return a frame at the scale at which its colours fit the photos best.
 
-    All scales of _SCALES are tried. Finer searches begin where the score stands out most from the scores two steps
-    away. This need not be the highest score. Far from the true scale all cameras may be in one place, so that scores
-    are high, but equal.
+    All scales of _SCALES are tried. Finer searches begin at the scale whose score stands out most from the scores of
+    scales two steps away. The score that stands out most need not be the highest: far from the true scale all cameras
+    may be in one place, so that scores are high, but equal.
     """
     scaled = [_scale_frame(frame, float(scale)) for scale in _SCALES]
     scale_gaussians = 2000  # Gaussians that the scales are tried on
@@ -316,7 +321,7 @@ def _solve_scale(inputs: AlignmentInput, frame: Similarity) -> Similarity:
 
 
 def _solve_shift(inputs: AlignmentInput) -> list[Similarity]:
-    """Solve for a shift of the cameras with which the photos show the Gaussians; return a list of one frame, or none.
+    """Solve for a shift of the cameras with which the photos show the Gaussians; return a list with one frame, or [].
 
     The middle of the Gaussians is searched in the picture of the middle camera, at many depths.
     """
@@ -338,14 +343,14 @@ def _solve_shift(inputs: AlignmentInput) -> list[Similarity]:
         return Similarity(np.eye(3), 1.0, shift, f"moved by {', '.join(f'{number:.10g}' for number in shift)}")
 
     def score(place: Sequence[float], samples: int) -> float:
-        """Return the score of the cameras in the frame of a place; 0 without colours to compare."""
+        """Return the score of the cameras in the frame of a place, see _PLACES; 0 without colours to compare."""
         check = check_cameras(*rows, make_frame(place).move_cameras(cameras), images, samples)
         return float(np.nan_to_num(check.share_seen * (1 - check.color_ratio)))
 
     places = sorted(product(*_PLACES), key=lambda place: -score(place, first_samples))
     best: list[tuple[float, ...]] = places[:first_places]
     for samples, count, step in _SHIFT_STEPS:
-        # each place itself, and one step along each axis in both directions
+        # tried are each place, and the places one step along each axis in both directions
         offsets = step * np.concatenate([np.zeros((1, 3)), np.diag((1, 1, 2.5)), -np.diag((1, 1, 2.5))])
         around = {tuple((place + offset).tolist()) for place in best for offset in offsets}
         best = sorted(sorted(around), key=lambda place: -score(place, samples))[:count]

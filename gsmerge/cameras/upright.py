@@ -1,11 +1,12 @@
 """Solve for the frame of rows that an exporter of the pixelSplat family centred, rescaled and turned upright.
 
 The exporter subtracts the median, divides by the 95 % quantile of the widest axis and rotates the world upright from
-the first camera. It saves none of these. Often the rows do not determine their cameras: views may be fused (FreeSplat),
-layers of a pixel may have gaps, or so many far pixels may be cut that no lines repeat. But the file is recognised by
-its median and quantile, so the rotation is known. Scale and shift are solved for from rows whose pixels are found by
-colours. A stretch of rows without a gap has the colours of a stretch of pixels of a photo. Stretches that agree on one
-frame are right, and all other matches are wrong.
+the first camera. No file stores median, quantile or rotation. Often the rows alone do not determine their cameras:
+views may be fused (FreeSplat), layers of a pixel may have gaps, or so many far pixels may be cut that no lines repeat.
+But the file is recognised by a median of 0 and a quantile of 1, which show the rotation that was used. Scale and shift
+are solved for from rows whose pixels are found by colours. A stretch of rows without a gap has the colours of a stretch
+of pixels of a photo. Stretches of rows whose matches agree on one frame are matched right, and all other matches are
+wrong.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from gsmerge.kernels.matrices import matmul
 from gsmerge.types import Cameras
 
 _LENGTH, _STRETCHES = 48, 96  # rows of a stretch, and places in the file at which stretches begin
-_SLACK = 8  # pixels by which the range of a search is wider than the possible places, on both sides
+_SLACK = 8  # pixels by which the range of a search exceeds the possible places on each side
 _ROUNDS = 3  # times that the frame is solved for from the stretches that agree with it
 
 
@@ -36,15 +37,15 @@ class _Stretch:
     view: int
     start: int  # first row
     step: int  # from one row to the next
-    # the first row is searched among the pixels of a photo from index low to index high
+    # the stretch's first row is searched among the pixels of a photo from index ``low`` to index ``high``
     low: int
     high: int  # exclusive
 
 
 def upright_rotation(inputs: AlignmentInput) -> Similarity | None:
-    """Return the rotation by which rows were turned upright from a camera; None if no camera explains them."""
+    """Return the rotation by which rows were turned upright from a camera; None if no camera explains the rows."""
     means = inputs.gaussians.means[inputs.valid].astype(np.float64)
-    # a first check uses rough_rows, and allows rough_tolerance as long as the rotation is unknown
+    # a first check of each rotation uses rough_rows rows, and allows deviations up to rough_tolerance
     rough_rows, rough_tolerance = 2000, 1.0
     sample = means[:: max(1, len(means) // rough_rows)]
     if not len(sample) or _measure_deviation(sample) > rough_tolerance:
@@ -71,7 +72,7 @@ def _measure_deviation(points: np.ndarray) -> float:
 def solve_upright(inputs: AlignmentInput, rotation: Similarity, path: str) -> Similarity:
     """Solve for the frame of upright rows from their colours in the photos.
 
-    Raises SceneError if too few stretches agree.
+    Raises SceneError, about the file at ``path``, if too few stretches agree.
     """
     orders = _possible_orders(len(inputs.gaussians), inputs.cameras) if len(inputs.images) else ()
     for pixels, stretches in orders:
@@ -89,10 +90,10 @@ def solve_upright(inputs: AlignmentInput, rotation: Similarity, path: str) -> Si
 def _possible_orders(count: int, cameras: Cameras) -> Iterator[tuple[np.ndarray, list[_Stretch]]]:
     """Yield the orders that ``count`` rows may have.
 
-    Each order is given by the pixels ``[p]`` of a photo that have rows, and by the stretches of rows that are searched
-    among these pixels.
+    An order is the pixels ``[p]`` of a photo that have rows, and the stretches of rows that are searched among these
+    pixels.
     """
-    # exporters of interleaved rows cut off a border
+    # exporters that write interleaved rows cut off a border
     grid, trim = np.arange(cameras.width * cameras.height).reshape(cameras.height, cameras.width), TRIMS[0]
     trimmed, whole = grid[trim:-trim, trim:-trim].reshape(-1), grid.reshape(-1)
     per_pixel_counts = (1, 2, 3)  # possible numbers of Gaussians of a pixel
@@ -108,7 +109,8 @@ def _possible_orders(count: int, cameras: Cameras) -> Iterator[tuple[np.ndarray,
 def _interleaved_stretches(count: int, views: int, per_pixel: int, num_pixels: int) -> list[_Stretch]:
     """List stretches of rows that are sorted by line, column, layer and view, where some rows are missing.
 
-    Each view has ``num_pixels`` pixels with ``per_pixel`` rows. Empty if ``count`` rows cannot have this order.
+    Each view has ``num_pixels`` pixels with ``per_pixel`` rows. The list is empty if ``count`` rows cannot have this
+    order.
     """
     step = views * per_pixel
     dropped = num_pixels * step - count
@@ -125,7 +127,8 @@ def _interleaved_stretches(count: int, views: int, per_pixel: int, num_pixels: i
 def _fused_stretches(count: int, views: int, num_pixels: int) -> list[_Stretch]:
     """List stretches of rows of the first and of the last view, for views of ``num_pixels`` that were fused in order.
 
-    The rows of the first view come first, and the rows of the last view last. Empty for too few or too many rows.
+    ``count`` is the number of all rows. The rows of the first view come first, and the rows of the last view last. The
+    list is empty for too few or too many rows.
     """
     num_parts = 3  # stretches of fused views are taken from the first and the last third of the rows
     if not num_parts * _LENGTH <= count < views * num_pixels:
@@ -142,8 +145,8 @@ def _match_stretches(
 ) -> tuple[Correspondences, np.ndarray]:
     """Search for stretches in the photos; return sampled rows of stretches that match, and the stretch of each row.
 
-    A stretch matches if only one place in its photo has nearly the colours of its rows. The t rows are returned with
-    their pixels. The stretch of a row is its number among the stretches that match.
+    A stretch matches if only one place in its photo has nearly the colours of its rows. The t sampled rows are returned
+    with their pixels. The stretch of a row is its number among the stretches that match.
     """
     rows = np.array([stretch.start + stretch.step * np.arange(_LENGTH) for stretch in stretches])
     places, costs, second_costs = _place_stretches(inputs, stretches, rows, pixels).T
@@ -168,10 +171,10 @@ def _match_stretches(
 def _place_stretches(
     inputs: AlignmentInput, stretches: Sequence[_Stretch], rows: np.ndarray, pixels: np.ndarray
 ) -> np.ndarray:
-    """Return for each stretch its best place, the cost there, and the least cost elsewhere ``[s,3]``.
+    """Return for each stretch its best place, the cost at this place, and the least cost elsewhere ``[s,3]``.
 
-    A cost is the sum of squared differences of colours. Elsewhere means more than two pixels from the best place.
-    ``rows [s,l]`` are the rows of the stretches, which are searched among the ``pixels [p]`` of a photo.
+    A cost is the sum of squared differences of colours. A place is elsewhere if it is more than two pixels from the
+    best place. ``rows [s,l]`` are the rows of the stretches, which are searched among the ``pixels [p]`` of a photo.
     """
     with np.errstate(invalid="ignore"):
         colors = np.nan_to_num(sh0_to_rgb(inputs.gaussians.sh0[:, 0])).clip(0, 1).astype(np.float32)
@@ -193,20 +196,21 @@ def _place_stretches(
 def _solve_agreed_frame(
     inputs: AlignmentInput, pairs: Correspondences, parts: np.ndarray, rotation: Similarity
 ) -> Similarity | None:
-    """Solve for the scale and shift that most stretches agree on; None if too few agree.
+    """Solve for the scale and shift that most stretches agree on; None if too few stretches agree.
 
-    ``parts [t]`` are the stretches of the pairs.
+    ``parts [t]`` is the stretch of each pair of a row and a pixel.
     """
     stretches = np.unique(parts)
     views = np.array([pairs.views[parts == stretch][0] for stretch in stretches])
-    # at least min_views need min_stretches that agree, and min_agreeing is the least share of stretches that agree
+    # at least min_views views need min_stretches stretches that agree, and the share min_agreeing of all stretches must
+    # agree
     min_views, min_stretches, min_agreeing = 2, 3, 0.25
     if len(np.unique(views)) < min_views:
         return None
     limit, rng = pixel_limit(inputs.cameras.width, inputs.cameras.height), np.random.default_rng(0)
 
     def solve(some_stretches: np.ndarray) -> Similarity | None:
-        """Solve for the frame of some stretches."""
+        """Solve for the frame in which some stretches lie in their pixels."""
         selected = pairs.select(np.isin(parts, some_stretches))
         rays = ray_directions(selected, inputs.cameras)
         return solve_frame(selected.points, rays, rotation.rotation)
@@ -220,7 +224,7 @@ def _solve_agreed_frame(
 
     best = stretches[:0]
     num_pairs = 200  # pairs of stretches from which a frame is tried
-    max_multiple = 3.0  # a stretch agrees with the frame of a pair if its error is below this multiple of the limit
+    max_multiple = 3.0  # a stretch agrees with a tried frame if its error is below this multiple of the limit
     for _ in range(num_pairs):
         first = rng.choice(len(stretches))
         second = rng.choice(np.flatnonzero(views != views[first]))

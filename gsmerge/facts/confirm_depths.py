@@ -1,9 +1,10 @@
 """Scene with pixels -> the share of its depth that other views confirm, which predicts whether a fit can succeed.
 
-Each pixel's Gaussian is projected into the other views. The Gaussian in front at that place is projected back. If it
-returns near the pixel, at about the same depth, the other view confirms the pixel. A pixel is contradicted if more
-views see through its surface than confirm it, and alone if its position is outside of all other views. A pixel does not
-count if other views have no Gaussian at its position, for example beyond a crop.
+Each pixel's Gaussian is projected into the other views. The Gaussian that another view shows in front at this place is
+projected back into the first view. If this Gaussian lands near the pixel, at about the same depth, the other view
+confirms the pixel. A pixel is contradicted if more views see through its surface than confirm it, and alone if its
+position is outside of all other views. A pixel does not count if other views have no Gaussian at its position, for
+example beyond a crop.
 """
 
 from __future__ import annotations
@@ -28,23 +29,23 @@ CONFIRM_NEIGHBORS = 16  # nearest other views in which the sampled pixels are lo
 AGREEMENT_SHARE, AGREEMENT_PIXELS = 1 / 120, 1.5
 SAME_LOG_DEPTH = 0.05  # difference of the logarithms of two depths of one surface
 LEAST_DEPTH = 1e-9  # least depth, canonical units
-# A result is expected to be poor if the share of confirmed pixels is below POOR_SHARE. This bound separates the poor
-# results of 15 captures from the sound ones. If the share of alone pixels is above LONELY_SHARE, the cause is that too
-# few views see the pixels
+# A result is expected to be poor if the share of confirmed pixels is below POOR_SHARE. POOR_SHARE separates the poor
+# results of 15 captures from the sound results. If the share of alone pixels is above LONELY_SHARE, a poor result is
+# blamed on too few views
 POOR_SHARE, LONELY_SHARE = 0.5, 0.2
-# Chance may change a share by CHANCE_ERRORS standard errors. From fewer samples than NORMAL_SAMPLES nothing follows
+# Chance may change a share by CHANCE_ERRORS standard errors. Fewer samples than NORMAL_SAMPLES decide nothing
 CHANCE_ERRORS, NORMAL_SAMPLES = 2.0, 30
 # Parts of pictures, as ranges of columns and of rows in thirds. A part is poor if more than the share POOR_PART_SHARE
-# of its pixels is poor
+# of its pixels is contradicted, or alone
 THIRDS = {
     "left third": ((0, 1), (0, 3)), "right third": ((2, 3), (0, 3)), "upper third": ((0, 3), (0, 1)),
     "lower third": ((0, 3), (2, 3)), "middle": ((1, 2), (1, 2)),
 }  # fmt: skip
 POOR_PART_SHARE = 0.5  # share of the pixels of a part, above which the part is poor
-# Useful number of Gaussians per pixel. It is MOST_PER_PIXEL if at least SOUND_SHARE of the pixels are confirmed, and
-# FEWEST, the usual number, if at most WRONG_SHARE are confirmed. With more Gaussians a fit memorises the photos
-# (docs/guide/how-many.md). With MOST_PER_PIXEL, all captures whose depth was confirmed lost less than .1 dB in photos
-# that the fit had not seen
+# The useful number of Gaussians per pixel is MOST_PER_PIXEL if at least SOUND_SHARE of the pixels are confirmed, and
+# FEWEST, the usual number, if at most WRONG_SHARE are confirmed. With more Gaussians than are useful, a fit memorises
+# the photos (docs/guide/how-many.md). With MOST_PER_PIXEL instead of FEWEST, captures whose depth was confirmed lost at
+# most .1 dB in photos that the fit had not seen
 MOST_PER_PIXEL, FEWEST, SOUND_SHARE, WRONG_SHARE = 0.07, parse_share(SHARE), 0.75, 0.6
 
 
@@ -52,8 +53,8 @@ MOST_PER_PIXEL, FEWEST, SOUND_SHARE, WRONG_SHARE = 0.07, parse_share(SHARE), 0.7
 class Agreement:
     """Shares of a scene's pixels whose depth other views confirm or contradict, or that no other view sees."""
 
-    confirmed: float  # A view confirms the depth, and no larger number of views sees through it
-    contradicted: float  # More views see through it than confirm it
+    confirmed: float  # A view confirms the depth, and no larger number of views sees through the surface
+    contradicted: float  # More views see through the surface than confirm the depth
     alone: float  # No other view sees the position
     num_pixels: int = field(default=CONFIRM_PIXELS, compare=False)  # Number of sampled pixels that count
     # Part of the pictures in which most pixels are contradicted, such as "left third of 4 of 7 views"; empty for none
@@ -63,12 +64,12 @@ class Agreement:
     from_one_point: bool = field(default=False, compare=False)
 
     def to_dict(self) -> dict[str, float]:
-        """Return the shares of the scene, for reports."""
+        """Return the confirmed, contradicted and alone shares, for reports."""
         return {name: round(getattr(self, name), 4) for name in ("confirmed", "contradicted", "alone")}
 
     @property
     def share(self) -> float:
-        """Useful number of Gaussians per pixel; more would not show new views better."""
+        """Useful number of Gaussians per pixel; with more Gaussians, new views would not look better."""
         soundness = (self.confirmed - WRONG_SHARE) / (SOUND_SHARE - WRONG_SHARE)
         return FEWEST + (MOST_PER_PIXEL - FEWEST) * min(1.0, max(0.0, soundness))
 
@@ -114,7 +115,7 @@ def confirm_depths(scene: Scene) -> Agreement | None:
 
 
 def _count_view(scene: Scene, view: int) -> np.ndarray:
-    """Return numbers of sampled pixels of a view, ``[part,4]``: all that count, confirmed, contradicted, alone.
+    """Count the sampled pixels of a view, ``[part,4]``: those that count, are confirmed, are contradicted, are alone.
 
     The first part is the whole picture; the other parts are ``THIRDS``.
     """
@@ -151,10 +152,10 @@ def _look_up_pixels(scene: Scene, view: int, rows: np.ndarray) -> tuple[np.ndarr
     is_alone = np.asarray(~inside.any(0))
     is_counted = is_alone.copy()
     is_counted[ids] = True
-    surface = means.take(front[has_front], 0).astype(np.float64)  # the points that the neighbours show there
+    surface = means.take(front[has_front], 0).astype(np.float64)  # the points that the neighbours show at these pixels
     distance = _distance_back(surface, rows[ids], cameras[[view]])
     surface_depths = camera_depths(surface, cameras.viewmats[neighbors[neighbor_ids]])
-    # how far the point is behind the neighbour's surface (above 0), or in front of it
+    # how far the point is behind the neighbour's surface (above 0), or in front of this surface (below 0)
     log_depths = log(depths[neighbor_ids, ids] / np.maximum(surface_depths, LEAST_DEPTH))
     agrees = (distance < 1) & (np.abs(log_depths) < SAME_LOG_DEPTH)
     sees_through = ~agrees & ((log_depths < -2 * SAME_LOG_DEPTH) | ((log_depths < 0) & (distance > 2)))
@@ -185,7 +186,7 @@ def _worst_part(poor: np.ndarray, pixels: np.ndarray) -> str:
     """Name the part of the pictures that is poor in most views, as "left third of 4 of 7 views".
 
     ``poor [v,part]`` are numbers of poor pixels, and ``pixels [v,part]`` of all pixels that count. The result is empty
-    if all parts are poor in equally many views.
+    if all parts are poor in the same number of views, because then no part stands out.
     """
     views = (poor > POOR_PART_SHARE * np.maximum(pixels, 1)).sum(0)
     worst = int(views.argmax())

@@ -11,17 +11,19 @@ from gsmerge.settings.budget import AUTO, DEVICES, BudgetOptions, parse_budget, 
 from gsmerge.settings.stages import DecodeOptions, SegmentOptions
 
 STREAMED_LEVELS = 3  # levels of detail of a lod-meta.json; the coarsest, a sixteenth of the Gaussians, loads at once
-LEVEL_FACTOR = 4  # each level of detail has this many times fewer Gaussians than the next finer one
+LEVEL_FACTOR = 4  # each level of detail has this many times fewer Gaussians than the next finer level
 FEW_PIXELS = 1 << 18  # pixels of a few small photos
-# A scene has few Gaussians if it has fewer than this number per pixel of its photos. At most FEW_PIXELS pixels count.
-# The number of superpixels is then a share of the pixels, but at most FEW times the number of Gaussians
+# A scene has few Gaussians if it has fewer than FEW per pixel of its photos; at most FEW_PIXELS pixels count. In a
+# scene of few Gaussians the number of superpixels is a share of the pixels, but at most FEW times the number of
+# Gaussians
 FEW = 0.5
 
 
 def exact_count(options: BudgetOptions, num_input: int, sh_degree: int) -> int | None:
-    """Return the number of Gaussians that a budget or a file size requests; None if there is neither.
+    """Return the number of Gaussians that a budget or a file size requests; None if neither is given.
 
-    ``num_input`` is the number that a share refers to, and ``sh_degree`` decides how many Gaussians a file holds.
+    A budget that is a share refers to ``num_input`` Gaussians. ``sh_degree`` decides how many Gaussians fit into a
+    file.
     """
     device = DEVICES.get(str(options.budget))
     if device is not None:  # a device requests a number if the option says to fill it, or if the useful number is known
@@ -36,7 +38,10 @@ def exact_count(options: BudgetOptions, num_input: int, sh_degree: int) -> int |
 
 
 def level_counts(finest: int, num_levels: int, least: int = 1) -> list[int]:
-    """Return the numbers of Gaussians of the coarser levels of detail, below ``finest``; none is below ``least``."""
+    """Return the numbers of Gaussians of the coarser levels of detail, without numbers below ``least``.
+
+    ``num_levels`` is the number of all levels, of which the finest has ``finest`` Gaussians.
+    """
     return [count for level in range(1, num_levels) if (count := finest // LEVEL_FACTOR**level) >= least]
 
 
@@ -67,7 +72,10 @@ def file_size(options: BudgetOptions) -> FileSize | None:
 
 
 def max_allowed(options: BudgetOptions, num_input: int, sh_degree: int) -> int:
-    """Return the largest number of Gaussians that budget, file size and device allow, at most ``num_input``."""
+    """Return the largest number of Gaussians that budget, file size and device allow, at most ``num_input``.
+
+    ``sh_degree`` decides how many Gaussians fit into a file.
+    """
     limits = DEVICES.get(str(options.budget)), exact_count(options, num_input, sh_degree), options.most
     return min([num_input, *(limit for limit in limits if limit is not None)])
 
@@ -80,14 +88,14 @@ class CountLimits:
     default: int  # Gaussians that `superpixels` and K give
     min_count: int  # Least number of Gaussians of a result: one for each view
     max_count: int  # Largest number of Gaussians that a budget, a size or a device allows
-    exact: int | None  # Gaussians that a budget or a size requests; None if there is neither
+    exact: int | None  # Gaussians that a budget or a size requests; None if neither is given
     num_pixels: int  # Pixels of all views
     num_input: int  # Gaussians of the scene
     most: int  # Useful number of Gaussians; if it is unknown, all Gaussians of the scene
 
     @property
     def count(self) -> int | None:
-        """Number of Gaussians set by a budget, a size or a device; None if ``superpixels`` and K decide."""
+        """Number of Gaussians that a budget, a size or a device sets; None if ``superpixels`` and K decide it."""
         if self.exact is not None:
             return self.exact
         return self.max_count if self.default > self.max_count else None
@@ -108,8 +116,8 @@ def count_limits(
 ) -> CountLimits:
     """Compute the limits on the number of Gaussians.
 
-    A budget that is a share refers to ``num_input`` Gaussians, or to those of the scene if this is None. Raises
-    UsageError if more superpixels are requested than there are pixels, or fewer Gaussians than views.
+    A budget that is a share refers to ``num_input`` Gaussians, or to those of the scene if ``num_input`` is None.
+    Raises UsageError if more superpixels are requested than there are pixels, or fewer Gaussians than views.
     """
     count, views = scene.num_gaussians, scene.num_views
     exact = exact_count(budget, count if num_input is None else num_input, scene.sh_degree)
@@ -134,8 +142,9 @@ def count_limits(
 def superpixels_per_view(scene: SceneSize, segment: SegmentOptions) -> int:
     """Return the number of superpixels per view.
 
-    If the option ``superpixels`` is a share, it refers to the pixels. If views have no Gaussians of their own, and if
-    there are fewer Gaussians than pixels, it refers to the Gaussians. Scenes of few Gaussians (:data:`FEW`) get more.
+    If the option ``superpixels`` is a share, this is a share of the pixels. If views have no Gaussians of their own,
+    and if there are fewer Gaussians than pixels, the option is a share of the Gaussians. Scenes of few Gaussians
+    (:data:`FEW`) get more superpixels than this share.
     """
     per_view = count_for(segment, scene.height, scene.width)
     if scene.has_own_pixels or segment.per_view is not None:
@@ -158,7 +167,7 @@ def _few_pixels(scene: SceneSize) -> int:
 
 
 def default_count(scene: SceneSize, segment: SegmentOptions, decode: DecodeOptions) -> int:
-    """Return the number of Gaussians that ``superpixels`` and K give; without views, a share of the Gaussians."""
+    """Return the number of Gaussians that ``superpixels`` and K give, or without views a share of the Gaussians."""
     count, views = scene.num_gaussians, scene.num_views
     if views == 0:
         return round(max(1, int(segment.share * count)) * decode.mean_k)
@@ -168,7 +177,7 @@ def default_count(scene: SceneSize, segment: SegmentOptions, decode: DecodeOptio
 
 
 def count_for(options: SegmentOptions, height: int, width: int) -> int:
-    """Return the number of superpixels for a view of ``height`` x ``width`` pixels; UsageError if it is too small."""
+    """Return the number of superpixels of a view of ``height`` x ``width`` pixels; UsageError if these are too few."""
     if options.per_view is not None:
         if options.per_view > height * width:
             limit = f"{height * width}, one per pixel of {width} x {height}"

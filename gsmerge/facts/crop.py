@@ -1,4 +1,4 @@
-"""Scene -> the scene inside a crop: the Gaussians inside it, and masks of the pixels that mostly show these."""
+"""Scene -> the scene inside a crop: the Gaussians in the crop, and masks of the pixels that mostly show them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gsmerge.runtime.threads import use_threads
 from gsmerge.settings.stages import parse_crop
 from gsmerge.types import Region, Scene
 
-MOSTLY = 0.5  # share of a pixel's opacity above which it shows mostly the inside
+MOSTLY = 0.5  # a pixel mostly shows the inside if more than this share of its opacity is from Gaussians inside
 
 
 def find_region(crop: str) -> Region:
@@ -37,9 +37,9 @@ def inside_crop(means: np.ndarray, crop: str) -> np.ndarray:
 
 
 def crop_scene(scene: Scene, crop: str) -> Scene:
-    """Return the scene of the Gaussians inside a crop; its photos count only at pixels that mostly show these.
+    """Return the scene of the Gaussians inside a crop; photos count only at pixels that mostly show these Gaussians.
 
-    Counts, the fit and scores then refer to the crop. Raises UsageError if no Gaussian is inside.
+    Counts, the fit and scores of the returned scene refer to the crop. Raises UsageError if no Gaussian is inside.
     """
     means, region = scene.gaussians.means, find_region(crop)
     inside = lies_inside(region, means)

@@ -1,7 +1,8 @@
 """Scene -> the scene with drawings of its Gaussians outside of all views.
 
-A fit to photos alone loses what no photo shows. So pictures of the input are added as photos of these Gaussians. If a
-scene lacks the camera of a photo, its result then lacks only what the photo itself would have added.
+A fit to photos alone loses the Gaussians that no photo shows. To keep these Gaussians, pictures of the input that show
+them are added as photos. If a scene lacks the camera of a photo, its result then lacks only what this photo would have
+added.
 """
 
 from __future__ import annotations
@@ -24,19 +25,21 @@ from gsmerge.runtime.record import note, record_choices
 from gsmerge.types import Cameras, Gaussians, LargePhotos, PicturedScene, Pixels, make_scene
 
 # Cameras are placed if views miss at least this share of the Gaussians. A placed camera is used if at least this share
-# of its pixels shows mainly such Gaussians. In fifteen captures in voxels, at most .001 of the Gaussians are outside of
-# all views. Two of the four views of a narrow capture miss .02, and two of the five views of another one .006
+# of its pixels shows mainly Gaussians that the views miss. In fifteen captures in voxels, at most .001 of the Gaussians
+# are outside of all views. If a narrow capture keeps two of its four views, they miss .02 of the Gaussians; two of the
+# five views of another capture miss .006 of them
 LEAST_OUTSIDE = 0.005
 SOURCES, STEPS_BACK = 4, 8  # number of views beside which cameras are placed, and of steps back from each
-# Bounds of the steps: back as a share of the depth, rotation to the sides, and rotation up or down, both in degrees
+# Bounds of a step: way back as a share of the depth, rotation to the sides and rotation up or down in degrees
 BESIDE_LOW, BESIDE_HIGH = (0.2, -20.0, -15.0), (1.0, 20.0, 15.0)
 
 
 def draw_outside(scene: PicturedScene) -> PicturedScene:
     """Add pictures of the input from placed cameras, with a note, if the views miss a part of the Gaussians.
 
-    The placed cameras come last. Their pixels count only if they show mainly Gaussians that no view sees. The scene is
-    canonical, and its rows are not pixels. It is returned unchanged if its views miss too little.
+    The placed cameras come last. Pixels of the placed cameras count only if they show mainly Gaussians that no view
+    sees. The scene is canonical, and its rows are not pixels. The scene is returned unchanged if its views miss too few
+    Gaussians.
     """
     outside = scene.get_pixels().homes < 0
     if outside.mean() < LEAST_OUTSIDE or outside.all():  # if all are outside, the cameras are wrong
@@ -75,9 +78,9 @@ def _place_beside(gaussians: Gaussians, outside: np.ndarray, cameras: Cameras) -
 
 
 def _turn_around(cameras: Cameras) -> Cameras:
-    """Return copies of cameras that are turned about their centres, all around in steps of half their field.
+    """Return copies of cameras that are turned about their centres, all around in steps of half the field of view.
 
-    In each of these directions a copy looks straight ahead, one up by half the field, and one down.
+    At each step one copy looks straight ahead, one looks up by half the field, and one looks down.
     """
     viewmats, views = [], []
     for view, (viewmat, K) in enumerate(zip(cameras.viewmats.astype(np.float64), cameras.Ks, strict=True)):
@@ -91,7 +94,7 @@ def _turn_around(cameras: Cameras) -> Cameras:
 
 
 def _with_drawings(scene: PicturedScene, cameras: Cameras, counting: np.ndarray) -> PicturedScene:
-    """Add drawings of a scene in ``cameras``; they count like photos at the pixels in the mask ``counting [c,h,w]``."""
+    """Add drawings of a scene from ``cameras``, which count like photos at pixels in the mask ``counting [c,h,w]``."""
     masks = np.full(scene.images.shape[:3], True) if scene.masks is None else scene.masks
     importance, empty, large = scene.importance, scene.empty, scene.large_photos
     if large is not None:
@@ -107,7 +110,7 @@ def _with_drawings(scene: PicturedScene, cameras: Cameras, counting: np.ndarray)
 
 
 def _with_pixels_of(scene: PicturedScene, cameras: Cameras) -> Pixels:
-    """Return the pixels of a scene with those of further ``cameras``; Gaussians keep the pixels that they have."""
+    """Return the pixels of a scene with those of further ``cameras``; Gaussians that have a pixel keep it."""
     pixels, placed = scene.get_pixels(), find_pixels(make_scene(scene.gaussians, cameras))
     placed_homes = np.where(placed.homes < 0, -1, placed.homes + len(scene) * scene.pixels_per_view)
     homes = np.where(pixels.homes < 0, placed_homes, pixels.homes)
@@ -115,7 +118,7 @@ def _with_pixels_of(scene: PicturedScene, cameras: Cameras) -> Pixels:
 
 
 def _with_large_drawings(large: LargePhotos, gaussians: Gaussians, cameras: Cameras) -> LargePhotos:
-    """Add drawings of the Gaussians in ``cameras`` to large photos; each is drawn when it is read."""
+    """Add drawings of the Gaussians from ``cameras`` to large photos; a drawing is made when it is read."""
     Ks = cameras.Ks * np.array([[large.width / cameras.width], [large.height / cameras.height], [1.0]])
     at_size = replace(cameras, Ks=Ks, width=large.width, height=large.height)
     first = max(large.ids) + 1

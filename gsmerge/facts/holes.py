@@ -1,9 +1,9 @@
 """Fill the holes of an export: add Gaussians at pixels that no Gaussian covers.
 
 Exporters drop borders, far regions and faint rows, and voxels have gaps. Each view is drawn from its own camera. Each
-empty pixel of the drawing gets a Gaussian with the colour of the picture. The candidates for its depth are the depth of
-the surface beside the pixel, and depths beyond the view's farthest surface. The depth is chosen at which the pictures
-of the nearest other views agree best.
+empty pixel of the drawing gets a Gaussian with the colour of the picture. The new Gaussian gets the depth of the
+surface beside the pixel, or a depth beyond the view's farthest surface. Of these depths, the one is chosen at which the
+pictures of the nearest other views agree best.
 """
 
 from __future__ import annotations
@@ -27,15 +27,16 @@ from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians, PicturedScene, fill_pixels
 
-# These numbers were chosen on exports of eight captures as Depth Anything 3 writes them, and on the same exports with
-# shuffled and with merged rows
+# The numbers from HOLE_OPACITY to BARE were chosen on exports of eight captures as Depth Anything 3 writes them, and on
+# the same exports with shuffled and with merged rows
 HOLE_OPACITY = 0.75  # opacity of the drawing below which a pixel is empty
 # Shares of the usual opacity of a view, which is low if the export has few rows. A pixel shows nothing if its opacity
-# is below the share NOTHING. It is in an empty part only if the mean opacity around it is below the share SPARSE
+# is below the share NOTHING. A pixel is in an empty part if it shows nothing, and if the mean opacity around it is
+# below the share SPARSE
 NOTHING, SPARSE = 0.5, 0.25
-# A part stays empty if a square with the side LARGE_SIDE, a share of the picture's longer side, fits into it. All such
-# squares together must cover at least the share LARGE_AREA of the picture. A rim of RIM_PIXELS pixels is taken off the
-# part
+# A part of a picture stays empty if a square with the side LARGE_SIDE, a share of the picture's longer side, fits into
+# the part. All squares that fit must together cover at least the share LARGE_AREA of the picture. A rim of RIM_PIXELS
+# pixels is taken off each empty part
 LARGE_SIDE, LARGE_AREA, RIM_PIXELS = 1 / 12, 0.12, 2
 GAP_WIDTH = 1 / 53  # beside large empty parts, only gaps narrower than this share of the longer side are filled
 MOST_EMPTY = 0.5  # from this share of empty pixels on, the scene may be only a part of what the photos show
@@ -50,11 +51,11 @@ BARE = 0.02  # opacity up to which a pixel's own Gaussian shows nothing
 def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = False) -> PicturedScene:
     """Add a Gaussian at each pixel of a canonical scene that no Gaussian covers, except in large empty parts.
 
-    ``shown [v,h,w]`` marks pixels with a usable picture. The new Gaussians come after the others. None is added if most
-    of the pixels are empty, because photos may show more than the scene. Large connected parts of a view without
-    Gaussians stay empty, because the scene may have been cut out, or its model may have left out the sky. With
-    ``everywhere``, these parts are filled, too. In a cropped scene, all pixels without Gaussians stay empty. Notes say
-    what was filled and what stays empty.
+    ``shown [v,h,w]`` marks pixels with a usable picture. The new Gaussians come after the others. No Gaussian is added
+    if most of the pixels are empty, because photos may show more than the scene. Large connected parts of a view
+    without Gaussians stay empty, because the scene may have been cut out, or its model may have left out the sky. With
+    ``everywhere``, large empty parts are filled, too. In a cropped scene, all pixels without Gaussians stay empty.
+    Notes say what was filled and what stays empty.
     """
     fronts, is_cropped = scene.get_pixels().fronts, scene.region is not None
     fillable = shown & (fronts < 0)  # pixels with a picture and without a Gaussian of their own
@@ -119,7 +120,7 @@ class _Edges:
 
 
 def _fill_views(scene: PicturedScene, holes: np.ndarray, edges: Mapping[int, _Edges]) -> PicturedScene:
-    """Return a scene with Gaussians added in the ``holes [v,h,w]`` of views with ``edges``, with a note.
+    """Return a scene with Gaussians added in the ``holes [v,h,w]`` of the views that have ``edges``, with a note.
 
     The holes of all other views are removed from ``holes``.
     """
@@ -139,8 +140,8 @@ def large_parts(empty: np.ndarray) -> np.ndarray:
     """Return a mask ``[h,w]`` of the connected parts of ``empty [h,w]`` that hold a large square, without their rim.
 
     Gaps, and the borders that exporters leave out, are narrower than a large square. The mask has no pixel if all
-    squares together cover less than ``LARGE_AREA``. So the tenth of the pixels that Depth Anything 3 leaves out does
-    not count.
+    squares together cover less than ``LARGE_AREA``. Depth Anything 3 leaves out a tenth of the pixels, which is less
+    than ``LARGE_AREA``.
     """
     if empty.mean() < LARGE_AREA:
         return np.zeros_like(empty)
@@ -157,7 +158,7 @@ def large_parts(empty: np.ndarray) -> np.ndarray:
 def _leave_empty(scene: PicturedScene, empty: np.ndarray) -> PicturedScene:
     """Return a scene whose pictures are black, and do not count in scores, at pixels that stay ``empty [v,h,w]``.
 
-    If photos counted at these pixels before, a note says that they no longer do.
+    A note says at which share of the pixels photos no longer count.
     """
     if not empty.any() or empty.all():
         return scene
@@ -195,7 +196,7 @@ def make_round_gaussians(
 ) -> Gaussians:
     """Make round Gaussians at ``depths [n]`` along ``rays [n,3]`` from ``eye``, with ``colors [n,3]`` (sRGB).
 
-    ``size`` is their standard deviation at depth 1, ``num_higher`` the number of harmonics above degree 0.
+    ``size`` is the standard deviation of a Gaussian at depth 1, ``num_higher`` the number of harmonics above degree 0.
     """
     return Gaussians(
         means=(eye + depths[:, None] * rays).astype(np.float32),
@@ -212,8 +213,8 @@ def _choose_depths(
 ) -> np.ndarray:
     """Choose one of ``depths [d,n]`` for each of ``rays [n,3]``: where the nearest other views show the same colour.
 
-    Differences of colours are averaged over neighbouring ``holes [h,w]``. If no view sees a point, the first depth is
-    chosen.
+    Differences of colours are averaged over neighbouring ``holes [h,w]``. If no other view sees the points of a ray,
+    its first depth is chosen.
     """
     centres = scene.cameras.centres
     neighbors = [i for i in nearest_views(centres, view) if (centres[i] != centres[view]).any()][:HOLE_NEIGHBORS]
@@ -223,7 +224,7 @@ def _choose_depths(
     min_gain = 0.001  # least gain in the difference of colours (sRGB) for each step to a farther depth
     min_weight = 1e-3  # least weight, in the window of DIFFERENCE_BLUR, of pixels that other views see
     for step, depth in enumerate(depths):
-        sums = np.zeros((*holes.shape, 2), np.float32)  # sums of differences, and their number
+        sums = np.zeros((*holes.shape, 2), np.float32)  # sums of differences, and numbers of differences
         for neighbor, (start, along) in zip(neighbors, neighbor_rays, strict=True):
             add_differences(scene.images[neighbor], along, start, depth, colors, pixels, sums)
         total, number = blur(sums, DIFFERENCE_BLUR).reshape(-1, 2)[pixels].T
@@ -233,9 +234,9 @@ def _choose_depths(
 
 
 def _rays_in(cameras: Cameras, view: int, eye: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Project rays ``[n,3]`` from ``eye`` into a view; return their start ``[3]`` and directions ``[3,n]``.
+    """Project rays ``[n,3]`` from ``eye`` into a view; return the start ``[3]`` and directions ``[3,n]`` of the pixels.
 
-    The point of a ray at a depth has the homogeneous pixel start + depth * direction.
+    The point of a ray at a depth has the homogeneous pixel ``start + depth * direction``.
     """
     K, (rotation, translation) = cameras.Ks[view], np.split(cameras.viewmats[view, :3], [3], 1)
     start = matmul(K, matmul(rotation, eye) + translation[:, 0])

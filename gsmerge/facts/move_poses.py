@@ -2,13 +2,14 @@
 
 Poses that a network predicts are wrong by some pixels. The Gaussians of a view have the same error as its pose, so
 every view agrees with itself but not with other views. The pixels of a view, at their depths, are projected into the
-photos of its neighbours. All poses are moved at once until the greys agree. This is direct image alignment (Engel et
-al., "Direct Sparse Odometry", 2018) with fixed depths, by Gauss-Newton steps, on small photos first. If one step at the
-smallest size shows that the poses are right, the scene stays unchanged bit for bit.
+photos of its neighbours. All poses are moved at once until the greys of both photos agree. The method is direct image
+alignment (Engel et al., "Direct Sparse Odometry", 2018) with fixed depths, by Gauss-Newton steps, on small photos
+first. If the first step on the smallest photos hardly moves the poses, they are right, and the scene stays unchanged
+bit for bit.
 
-Highlights move over their surfaces with the camera, and so look like wrong poses. The comparison therefore expects the
-changes of colour that the harmonics describe. New poses are kept only if the fine detail of the photos agrees no worse
-than before.
+Highlights move over their surfaces with the camera, and so look like wrong poses. The comparison of greys therefore
+expects the changes of colour that the harmonics describe. New poses are kept only if the fine detail of the photos
+agrees no worse than with the old poses.
 """
 
 from __future__ import annotations
@@ -38,26 +39,27 @@ from gsmerge.types import PicturedScene
 SIDES = (60, 120, 240)  # longer side of the photos in pixels, one size after the other
 BORDER = 2  # width in pixels of the border that is not compared
 POSE_PIXELS = 1500  # compared pixels of a view, those with the largest gradients
-# Compared pixels of a view, and largest number of steps, at the first size, at which right poses are recognised. The
-# numbers are small, because scenes with right poses need this time, too
+# At the first size, at which right poses are recognised: compared pixels of a view, and largest number of steps. The
+# check has few pixels and steps, because it takes time in scenes with right poses, too
 FIRST_PIXELS, FIRST_STEPS = 600, 2
 POSE_NEIGHBOURS = 4  # number of other views with which a view is compared
 POSE_STEPS = 6  # largest number of Gauss-Newton steps at each size
 TOGETHER = 16  # pairs of views that one task compares
 POSE_BLUR = 0.7  # blur of the photos, standard deviation in pixels
-# Detail of photos is finer than this blur, in pixels. Highlights are smooth. If new poses follow highlights, the detail
-# of surfaces agrees less than before. New poses are dropped if the loss is above CHANCE standard errors
+# Detail of photos is finer than the blur DETAIL, in pixels. Highlights are smooth. If new poses follow highlights, the
+# detail of surfaces agrees less than with the old poses. New poses are dropped if detail agrees less by more than
+# CHANCE standard errors
 DETAIL, CHANCE = 2.0, 2.0
-# Errors of poses are assumed to have these standard deviations: PRIOR_TURN in radians, and PRIOR_SHIFT in canonical
-# units. PRIOR is the weight of this assumption
+# Errors of poses are assumed to have the standard deviations PRIOR_TURN in radians and PRIOR_SHIFT in canonical units.
+# PRIOR is the weight of this assumption beside the photos
 PRIOR_TURN, PRIOR_SHIFT, PRIOR = 0.026, 0.03, 30.0
-# A gain is the share of the disagreement between photos that new poses remove. Poses are moved only if some view has a
-# gain above LEAST_GAIN at every size. At the largest size, the gain of some view must also be above VIEW_GAIN, or the
-# gain of all views together above MEAN_GAIN. Right poses have gains, too, if the depth is wrong. At the largest size
-# these are up to 0.14 for a view and 0.06 for all views together; with the poses of a depth camera up to 0.28 and 0.18.
-# If all poses are wrong by half a degree, the gain of all views is at least 0.22. If a single pose is wrong, the gain
-# of its view is 0.32 (14 captures). In doubt poses stay, because other photos of the scene have poses in the input's
-# frame
+# The gain of a view is the share of its photos' disagreement that new poses remove. Poses are moved only if some view
+# has a gain above LEAST_GAIN at every size. At the largest size, the gain of some view must also be above VIEW_GAIN, or
+# the gain of all views together above MEAN_GAIN. Right poses have gains, too, if the depth is wrong. At the largest
+# size, gains of right poses are up to 0.14 for a view and 0.06 for all views together. Poses of a depth camera have
+# gains up to 0.28 for a view and 0.18 for all. If all poses are wrong by half a degree, the gain of all views is at
+# least 0.22. If a single pose is wrong, the gain of its view is 0.32 (14 captures). In doubt the poses are not moved,
+# because photos outside the scene have poses in the same frame as the input
 LEAST_GAIN, VIEW_GAIN, MEAN_GAIN = 0.1, 0.3, 0.2
 
 
@@ -71,7 +73,7 @@ class _PhotoLevel:
     points: np.ndarray  # [n,3] float64, sampled points of all views, in their cameras' frames
     greys: np.ndarray  # [p,m] float32, greys that the second view of a pair should show at the points of the first
     starts: np.ndarray  # [v+1] index of the first point of each view
-    depths: np.ndarray  # [v,h,w] depths of the Gaussians at the pixels' middles, canonical units; NaN without one
+    depths: np.ndarray  # [v,h,w] depths of the Gaussians at the pixels' middles, canonical units; NaN for none
     first_viewmats: np.ndarray  # [v,4,4] poses of the input
     pairs: np.ndarray  # [p,2] a view, and the view in which it is looked up
 
@@ -80,8 +82,8 @@ class _PhotoLevel:
 class _Evidence:
     """Evidence from the pixels of the first view of each of p pairs about the relative pose of both views."""
 
-    # Curvature and slope of half the squared differences for a motion of the second view. A motion of the first view
-    # has the opposite effect, because only the relative pose counts
+    # Curvature and slope of half the squared differences of greys, by a motion of the second view. The same motion of
+    # the first view changes the differences the other way, because only the relative pose counts
     curvatures: np.ndarray  # [p,6,6]
     slopes: np.ndarray  # [p,6]
     costs: np.ndarray  # [p] mean disagreement of the pixels
@@ -91,9 +93,10 @@ class _Evidence:
 def move_poses(scene: PicturedScene, views: Sequence[int], *, always: bool = False) -> PicturedScene | None:
     """Move every camera, with the Gaussians of its pixels, so that the photos agree with each other.
 
-    Only ``views``, whose photos show the scene, are moved. With ``always`` even small errors are corrected. The median
-    motion of the views is subtracted from all motions. Returns None if no pose is wrong, if the photos are too small or
-    do not overlap, or if their detail agrees less after the move.
+    Only ``views``, whose photos show the scene, are moved. With ``always``, the cameras are moved even if the photos
+    hardly gain. The median motion of the views is subtracted from all motions, so that the scene as a whole stays in
+    place. Returns None if no pose is wrong, if the photos are too small or do not overlap, or if the detail of the
+    photos agrees less after the move.
     """
     start = scene.cameras.viewmats.astype(np.float64)
     largest, shortest = (f(scene.cameras.width, scene.cameras.height) for f in (max, min))
@@ -120,7 +123,7 @@ def move_poses(scene: PicturedScene, views: Sequence[int], *, always: bool = Fal
 
 
 def _choose_pairs(scene: PicturedScene, views: Sequence[int]) -> np.ndarray:
-    """Choose pairs of views ``[p,2]``, in both orders: each view with the neighbours of the largest overlap."""
+    """Choose pairs of views ``[p,2]``, in both orders: each view with the neighbours that it overlaps most."""
     cameras, fronts = scene.cameras, scene.get_pixels().fronts.reshape(len(scene), -1)
     overlap_pixels = 400  # the neighbours of a view are chosen by about this many of its pixels
     step = max(1, scene.pixels_per_view // overlap_pixels)
@@ -146,14 +149,15 @@ def _make_level(
 ) -> _PhotoLevel:
     """Shrink the photos by ``factor``, and choose at most ``samples`` pixels of each photo with large gradients.
 
-    With ``detail`` each photo is replaced by its difference from a blurred copy.
+    With ``detail``, each photo is replaced by its difference from a blurred copy. ``pairs [p,2]`` are the views to
+    compare.
     """
     photos = photos_of(scene.images, scene.cameras, factor)
     shape = photos.height, photos.width
     rows, columns = ((np.arange(n) + 0.5) / n for n in shape)
     nearest = np.ix_((rows * scene.cameras.height).astype(int), (columns * scene.cameras.width).astype(int))
     means, fronts = scene.gaussians.means, scene.get_pixels().fronts
-    spread = 0.5 + np.random.default_rng(0).random(shape)  # so that the pixels do not all lie on one edge
+    spread = 0.5 + np.random.default_rng(0).random(shape)  # so that chosen pixels do not all lie on one edge
     spread[:BORDER] = spread[-BORDER:] = spread[:, :BORDER] = spread[:, -BORDER:] = 0
 
     def sample_view(view: int) -> tuple[np.ndarray, ...]:
@@ -191,8 +195,9 @@ def _expect_greys(
 ) -> np.ndarray:
     """Return the greys ``[p,m]`` that the second view of each pair should show at the sampled points of the first.
 
-    These are the ``greys`` of the first view, changed like the colours of the Gaussians ``rows`` between the two views.
-    Otherwise a highlight, which moves over its surface with the camera, would look like a wrong pose.
+    The expected greys are the ``greys`` of the first view, plus the change of colour of the Gaussians ``rows`` from the
+    first view to the second. Without this change a highlight, which moves over its surface with the camera, would look
+    like a wrong pose.
     """
     g, eyes = scene.gaussians, scene.cameras.centres.astype(np.float32)
     expected = np.zeros((len(pairs), max(map(len, greys))), np.float32)
@@ -208,9 +213,9 @@ def _expect_greys(
 
 
 def _improve_poses(level: _PhotoLevel, viewmats: np.ndarray, *, check: bool) -> tuple[np.ndarray, _Evidence]:
-    """Improve poses by Gauss-Newton steps at one size; return the poses, and the evidence at these poses.
+    """Improve poses by Gauss-Newton steps at one size; return the new poses, and the evidence at the new poses.
 
-    With ``check`` there are few steps, and a single one if it shows that the poses are right.
+    With ``check``, at most FIRST_STEPS steps are taken, and only one step if it shows that the poses are right.
     """
     max_steps = FIRST_STEPS if check else POSE_STEPS
     right_px = 1.0  # poses are considered right if the first step moves all views by less than this, in pixels
@@ -227,7 +232,10 @@ def _improve_poses(level: _PhotoLevel, viewmats: np.ndarray, *, check: bool) -> 
 
 
 def _solve_step(level: _PhotoLevel, viewmats: np.ndarray, evidence: _Evidence) -> np.ndarray:
-    """Solve the normal equations of all pairs and of the prior for the next motion ``[v,6]`` of each view."""
+    """Solve the normal equations of all pairs and of the prior for the next motion ``[v,6]`` of each view.
+
+    ``evidence`` is the evidence at the poses ``viewmats [v,4,4]``.
+    """
     prior = PRIOR * np.tile(np.repeat([1 / PRIOR_TURN**2, 1 / PRIOR_SHIFT**2], 3), len(viewmats))
     curvature, slope = np.diag(prior), prior * motion_vectors(level.first_viewmats, viewmats).ravel()
     pairs = zip(level.pairs.tolist(), evidence.curvatures, evidence.slopes, strict=True)
@@ -243,12 +251,12 @@ def _solve_step(level: _PhotoLevel, viewmats: np.ndarray, evidence: _Evidence) -
 
 
 def _gather_evidence(level: _PhotoLevel, viewmats: np.ndarray) -> _Evidence:
-    """Compare the pixels of the first view of each pair with the photo of the second view, for the given poses."""
+    """Compare the pixels of the first view of each pair with the photo of the second view, at poses ``viewmats``."""
     count, max_points = level.greys.shape
     evidence = _Evidence(np.empty((count, 6, 6)), np.empty((count, 6)), np.empty(count), np.empty(count))
 
     def compare_pairs(begin: int) -> None:
-        """Fill the evidence of a few pairs."""
+        """Fill the evidence of a few pairs, from number ``begin`` on."""
         scratch, scratch_ids = np.empty((SCRATCH_COLUMNS, max_points)), np.empty(max_points, np.int64)
         compare_views(
             level.points, level.greys, level.starts, level.pairs, viewmats, level.first_viewmats, level.Ks,
@@ -261,7 +269,7 @@ def _gather_evidence(level: _PhotoLevel, viewmats: np.ndarray) -> _Evidence:
 
 
 def _view_flows(level: _PhotoLevel, evidence: _Evidence) -> np.ndarray:
-    """Return by how many pixels ``[v]`` the points of each view have moved since the input, the median of its pairs."""
+    """Return the shift ``[v]``, pixels, of each view's points since the input: the median of the view's pairs."""
     flows = [evidence.flows[(level.pairs == view).any(1)] for view in range(len(level.first_viewmats))]
     return np.array([median(view_flows) if len(view_flows) else 0.0 for view_flows in flows])
 
@@ -269,7 +277,8 @@ def _view_flows(level: _PhotoLevel, evidence: _Evidence) -> np.ndarray:
 def _any_wrong(level: _PhotoLevel, before: _Evidence, after: _Evidence, *, end: bool) -> bool:
     """Return whether some view moved far, and now agrees better with other views.
 
-    At the ``end`` the view has to agree much better, or all views together have to agree better.
+    At the largest size (``end``), a view that moved far has to agree much better, or all views together have to agree
+    better.
     """
     limit_px = 1.5  # a pose counts as wrong if it moves by more than this, in pixels of the views
     is_far = _view_flows(level, after) > limit_px

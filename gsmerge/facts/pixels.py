@@ -1,12 +1,12 @@
 """Scene -> the pixel of each Gaussian and the Gaussian in front of each pixel; also raise sizes far below a pixel.
 
 Pixels are found by projection of centres. Each view is divided into cells that are wider than the distances between
-neighbouring Gaussians. The front of a cell is the Gaussian that its pixels show most. Gaussians behind it are hidden. A
-pixel without a centre in it shows the front of its cell.
+neighbouring Gaussians. The front of a cell is the Gaussian that its pixels show most. Gaussians behind the front are
+hidden. A pixel that contains no centre shows the front of its cell.
 
-A renderer widens every Gaussian by the low-pass filter of the pixels. So Gaussians that are far smaller than a pixel,
-such as points that all got one tiny size, look sound. But functions that use the sizes without rendering would find an
-empty scene.
+A renderer widens every Gaussian by the low-pass filter of the pixels. Because of this filter, Gaussians that are far
+smaller than a pixel, such as points that all got one tiny size, look sound. But functions that use the sizes of such
+tiny Gaussians without rendering would find an empty scene.
 """
 
 from __future__ import annotations
@@ -28,30 +28,30 @@ from gsmerge.runtime.threads import in_turn
 from gsmerge.types import Pixels, Scene, SceneT
 
 # Cells are wide enough if at least this share of them has a centre. Only cells whose neighbours all have a centre are
-# examined. Of eight captures in voxels, six with shares of at least .97 give the same result as rendering. Two with .93
-# and .95 lose 1.5 and 5 dB
+# examined. Of eight captures in voxels, six have shares of at least .97, and the same result as with rendering. The two
+# captures with shares of .93 and .95 lose 1.5 and 5 dB
 COVERED_CELLS = 0.96
 SHOWN_WIDTH = 4.0  # width of a Gaussian that shows nearly all of it, in standard deviations
 ESTIMATE_GAUSSIANS = 10_000  # medians and shares are estimated from at least this many Gaussians, if there are as many
 SAME_DEPTH = 1.05  # a centre is on the surface of its cell up to this multiple of the depth of the cell's front
 LOW_PASS = math.sqrt(EPS2D)  # standard deviation of the low-pass, pixels
-# The low-pass hides a Gaussian whose scales are all below the share HIDDEN_SIZE of the low-pass. If less than the share
-# FEWEST_HIDDEN of the Gaussians is hidden, nothing changes, because a fit repairs so few. In placed views of sound
-# scenes up to .05 are hidden
+# The low-pass hides a Gaussian whose scales are all below the share HIDDEN_SIZE of the low-pass. If at most the share
+# FEWEST_HIDDEN of the Gaussians is hidden, nothing changes, because a fit repairs such a small share. In placed views
+# of sound scenes up to .05 of the Gaussians are hidden
 HIDDEN_SIZE, FEWEST_HIDDEN = 0.5, 0.1
 
 
 def with_pixels(scene: SceneT) -> SceneT:
-    """Return a canonical scene with pixels; if it has none, they are found by projection."""
+    """Return a canonical scene with pixels; if the scene has no pixels, they are found by projection."""
     return scene if scene.pixels is not None else replace(scene, pixels=find_pixels(scene))
 
 
 def raise_sizes(scene: SceneT, *, placed: bool = False) -> SceneT:
     """Return a canonical scene in which Gaussians that the low-pass hides have the size of the low-pass, with a note.
 
-    Gaussians that share a pixel may be smaller, because each shows a part of it. Otherwise views with few pixels would
-    change sound scenes. If the cameras were ``placed``, sizes are compared with the distance to the nearest Gaussian
-    instead of a pixel.
+    Gaussians that share a pixel may be smaller than it, because each shows a part of the pixel. If they counted as
+    hidden, sound scenes in views with few pixels would change. If the cameras were ``placed``, sizes are compared with
+    the distance to the nearest Gaussian instead of a pixel.
     """
     g, cameras, by_distance = scene.gaussians, scene.cameras, placed and len(scene.gaussians) > 1
     homes = np.full(len(g), -1) if scene.pixels is None else scene.pixels.homes
@@ -64,7 +64,7 @@ def raise_sizes(scene: SceneT, *, placed: bool = False) -> SceneT:
     units = find_nearest(g.means, 1)[1][:, 0] if by_distance else measure_pixel_sizes(g.means, homes, cameras)
     sizes, seen = g.scales.max(1), (homes >= 0) | by_distance
     num_sharing = 1 if by_distance else np.where(seen, np.bincount(homes + 1)[homes + 1], 1)
-    is_near = units < 1  # a pixel that is as large as the scene's median depth, or larger, is no measure
+    is_near = units < 1  # a pixel that is as large as the scene's median depth, or larger, is no measure of sizes
     hidden = (sizes * np.sqrt(num_sharing) < HIDDEN_SIZE * LOW_PASS * units) & is_near
     if np.count_nonzero(hidden & seen) <= FEWEST_HIDDEN * np.count_nonzero(seen):
         return scene
@@ -82,9 +82,9 @@ def find_pixels(scene: Scene) -> Pixels:
     """Find the pixel of each Gaussian of a canonical scene, and the front of each pixel.
 
     In each view, the weight of a Gaussian is opacity x transmittance x area in pixels. The pixel of a Gaussian is the
-    one with its centre in the view of its largest weight, or in the first such view. It is -1 if no view sees the
-    Gaussian. The front of a pixel is the Gaussian with the largest opacity x transmittance among those with a centre in
-    the pixel. If there are none, the pixel has the front of the cell around it, or -1 if the cell is empty.
+    pixel at its centre, in the first view in which it has its largest weight; -1 if no view sees the Gaussian. The
+    front of a pixel is the Gaussian with the largest opacity x transmittance among those with a centre in the pixel. A
+    pixel that contains no centre has the front of the cell around it, or -1 if the cell is empty.
     """
     g, cameras, count = scene.gaussians, scene.cameras, len(scene)
     means, scales, opacities = (np.ascontiguousarray(column, np.float32) for column in (g.means, g.scales, g.opacities))
@@ -106,9 +106,10 @@ def find_pixels(scene: Scene) -> Pixels:
 def _weigh_view(
     means: np.ndarray, scales: np.ndarray, opacities: np.ndarray, viewmat: np.ndarray, K: np.ndarray, fronts: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Weigh the Gaussians of one view in its cells, and fill ``fronts [h,w]`` with the front of each pixel.
+    """Weigh the Gaussians of one view in the cells of the view, and fill ``fronts [h,w]`` with the front of each pixel.
 
-    Returns the rows ``[m]`` that the view sees, their pixels ``[m]``, and their weights ``[m]`` in pixels.
+    Returns the rows ``[m]`` of the Gaussians that the view sees, their pixels ``[m]``, and their weights ``[m]`` in
+    pixels. The view has the camera ``viewmat [4,4]``, ``K [3,3]``.
     """
     height, width = fronts.shape
     ids, pixels, depths, areas = project_centres(means, scales, viewmat, K, width, height, NEAR_PLANE)
@@ -139,7 +140,7 @@ def choose_level(shown: np.ndarray, widest: float) -> int:
 
     Cells are wide enough if nearly all of them have a centre. Only cells whose neighbours all have a centre are
     examined. The result is one level above the smallest cells that are wide enough, so that hidden surfaces do not show
-    through where a centre is missing. It is 1 if no cells of up to ``widest`` pixels are wide enough.
+    through where a centre is missing. The result is 1 if no cells of up to ``widest`` pixels are wide enough.
     """
     fine, level = shown, 0
     while 2**level <= max(widest, 1.0):
@@ -153,7 +154,7 @@ def choose_level(shown: np.ndarray, widest: float) -> int:
 
 
 def _coarser(mask: np.ndarray) -> np.ndarray:
-    """Return a mask of half the size: True for each square of 2 x 2 pixels with a True pixel of ``mask [h,w]``."""
+    """Halve a mask ``[h,w]``: the result is True for each square of 2 x 2 pixels with at least one True pixel."""
     height, width = mask.shape
     even = np.pad(mask, ((0, height % 2), (0, width % 2)))
     lines = even[::2] | even[1::2]
@@ -161,7 +162,10 @@ def _coarser(mask: np.ndarray) -> np.ndarray:
 
 
 def _cells_of(pixels: np.ndarray, shape: tuple[int, ...], level: int) -> tuple[np.ndarray, tuple[int, int]]:
-    """Return the cell of each pixel ``[m]`` int32 of a picture ``[h,w]``, and the numbers of cells down and across."""
+    """Return the cell of each of ``pixels [m]`` int32 of a picture ``[h,w]``, and the numbers of cells down and across.
+
+    A cell of a ``level`` is 2**level pixels wide.
+    """
     height, width = shape
     rows, columns = np.divmod(pixels, np.int32(width))
     wide = -(-width // (1 << level))

@@ -1,4 +1,4 @@
-"""Place cameras in a scene that has none, or between and around its views; render pictures in place of photos."""
+"""Place cameras in a scene without cameras, or between and around the views of a scene; render pictures for photos."""
 
 from __future__ import annotations
 
@@ -29,18 +29,19 @@ FAR_RADII, NEAR_RADII = 2.0, 1.2  # distances of cameras around the scene, in it
 INSIDE = (0.0, -0.5, 0.5)  # positions of cameras inside, along each axis, as a share of half the extent
 INSIDE_DIRECTIONS = 8  # directions in which cameras look from each position inside
 FIELD = 1.0  # width of the image, divided by the focal length
-# Field of cameras at the place of a viewer (80 degrees), and size of their pixels in standard deviations of Gaussians
+# Field of cameras at a viewer's place, as FIELD (80 degrees), and size of their pixels in standard deviations of
+# Gaussians
 INSIDE_FIELD, INSIDE_PIXEL = 5 / 3, 1.5
 PROBE = 96  # pixels per side of the pictures for choosing candidates
 SMALLEST_PIXELS, LARGEST_PIXELS = 96, 640  # pixels per side
 NEAR_PLANE_SHARE = 0.02  # near plane, as a share of the scene's radius
-# Cameras are placed between a view and its PAIRS nearest views, at the share MIDDLE of the way
+# A camera is placed between a view and each of its PAIRS nearest views, at the share MIDDLE of the way
 PAIRS, MIDDLE = 2, 0.5
-WIDEST = np.pi / 4  # the space between two views is unknown if the angle between them is larger
-# With at most this many views, a fit to renders also gets views between them, because it would memorise so few views
+WIDEST = np.pi / 4  # the space between two views is unknown if the angle between their directions is larger
+# A fit to renders of at most this many views also gets renders between them, because it would memorise so few views
 FEW_RENDERED_VIEWS = 24
 OUTSIDE_SHARE, MOST_OUTSIDE = 0.5, 24  # number of views from outside as a share of all views, and its maximum
-# Bounds of the views from outside: step back as a share of the depth, rotation to the sides, and rotation up or down,
+# Bounds of views from outside: step back as a share of the depth, rotation to the sides and rotation up or down in
 # degrees
 OUTSIDE_LOW, OUTSIDE_HIGH = (0.0, -15.0, -10.0), (0.6, 15.0, 10.0)
 
@@ -56,10 +57,10 @@ NO_VIEWS = (
 
 
 def add_views(scene: Scene, *, shown: bool = False) -> Scene:
-    """Keep the finite Gaussians, and place cameras if there are none; notes say so.
+    """Keep the finite Gaussians, and place cameras in a scene without cameras; notes say what was left out or placed.
 
-    The cameras are those of a fit, or with ``shown``, those of :func:`place_viewpoints`, which are for people. Raises
-    ValueError if no Gaussian is finite.
+    The cameras are placed for a fit, or with ``shown`` for people who look at the scene (:func:`place_viewpoints`).
+    Raises ValueError if no Gaussian is finite.
     """
     scene = keep_finite(scene)
     if len(scene) == 0:
@@ -77,7 +78,7 @@ def _with_cameras(gaussians: Gaussians, cameras: Cameras) -> Scene:
 
 
 def place_inside(gaussians: Gaussians) -> Cameras | None:
-    """Place cameras around a viewer's place, looking to all sides; None if the scene was not made around a viewer."""
+    """Place cameras that look to all sides around a viewer's place; None if the scene was not made around a viewer."""
     viewer = find_viewer(gaussians[:: -(-len(gaussians) // CANDIDATE_GAUSSIANS)])
     if viewer is None:
         return None
@@ -92,7 +93,7 @@ def place_inside(gaussians: Gaussians) -> Cameras | None:
 
 
 def place_viewpoints(gaussians: Gaussians) -> Cameras:
-    """Place cameras for people to look from, where a viewer stands, or else first around the scene and then inside."""
+    """Place cameras for people to look from, at a viewer's place, or else first around the scene and then inside it."""
     return place_inside(gaussians) or _place_around_and_inside(gaussians)
 
 
@@ -109,7 +110,7 @@ def _place_around_and_inside(gaussians: Gaussians) -> Cameras:
 
 
 def keep_finite(scene: Scene) -> Scene:
-    """Return a scene of the finite Gaussians, with a note if others are left out; ValueError if there is none."""
+    """Return a scene of the finite Gaussians, with a note if some are left out; ValueError if no Gaussian is finite."""
     g = scene.gaussians
     finite = np.ones(len(g), bool)
     for array in vars(g).values():
@@ -128,8 +129,8 @@ def keep_finite(scene: Scene) -> Scene:
 def place_around(gaussians: Gaussians, count: int = FITTED) -> Cameras:
     """Place cameras to which a scene without cameras is fitted, and on which results are scored.
 
-    There are ``count`` cameras far away, ``count`` near by, at most ``count`` at positions that show most of the scene,
-    and ``count / 2`` on a walk through the scene.
+    ``count`` cameras are far away, ``count`` are near by, at most ``count`` are where they show most of the scene, and
+    ``count / 2`` are on a walk through the scene.
     """
     means = thin_out(gaussians, CANDIDATE_GAUSSIANS).means.astype(np.float64)
     centre, half = _robust_box(means)
@@ -146,14 +147,14 @@ def blank_pictures(scene: Scene) -> PicturedScene:
 
 
 def draw_pictures(scene: Scene) -> PicturedScene:
-    """Return a canonical scene with renders as the pictures of its views; ``empty`` is what the renders leave empty."""
+    """Return a canonical scene with renders as pictures of its views; ``empty`` is 1 minus the renders' opacity."""
     drawn = render(scene.gaussians, scene.cameras)
     pictured = PicturedScene.with_pictures(scene, np.clip(drawn.images, 0, 1, out=drawn.images), None)
     return replace(pictured, empty=1 - drawn.alphas[..., 0])
 
 
 def draw_around(scene: PicturedScene) -> PicturedScene:
-    """Add renders of a scene from outside its views and, if these are few, from between them.
+    """Add renders of a scene from outside its views and, if the scene has few views, from between the views.
 
     The renders come last. A scene with a single view is returned as it is.
     """
@@ -178,11 +179,11 @@ def draw_around(scene: PicturedScene) -> PicturedScene:
 
 
 def between_cameras(cameras: Cameras, *further: float) -> Cameras:
-    """Place a camera half way between each of two or more views and its nearest other views.
+    """Place a camera half way between each of two or more views and each of its nearest other views.
 
-    For each of the shares ``further``, each view gets one more camera at this share of the way to its nearest view.
-    Cameras lie on the screw motion from one pose to the other, so they look at the point at which both views look.
-    Pairs of views with an angle above ``WIDEST`` get no camera.
+    For each of the shares ``further``, each view gets one more camera at this share of the way to its nearest view. A
+    camera lies on the screw motion from one view's pose to the other's, so it looks at the point at which both views
+    look. Pairs of views with an angle above ``WIDEST`` get no camera.
     """
     viewmats = cameras.viewmats.astype(np.float64)
     nearest = [nearest_views(cameras.centres, view)[:PAIRS] for view in range(len(cameras))]
@@ -200,9 +201,10 @@ def place_cameras(gaussians: Gaussians, num_views: int = NUM_VIEWS) -> Cameras:
     """Place cameras that see as much of the scene as possible.
 
     Candidates stand on a sphere around the box of most Gaussians, looking in, and on a grid inside it, looking in all
-    directions. They are chosen one by one, at most ``num_views``. The next camera is always the candidate that shows
-    the most opacity not shown yet, in pictures of a sample of the Gaussians. Images are square and grow with the number
-    of Gaussians up to ``LARGEST_PIXELS`` pixels per side. Raises ValueError if there is no Gaussian.
+    directions. At most ``num_views`` candidates are chosen, one by one. The next camera is always the candidate that
+    adds most to the opacity that the chosen cameras show, in pictures of a sample of the Gaussians. Images are square
+    and grow with the number of Gaussians up to ``LARGEST_PIXELS`` pixels per side. Raises ValueError if there is no
+    Gaussian.
     """
     if len(gaussians) == 0:
         raise ValueError("expected at least one Gaussian, got none")
@@ -211,7 +213,7 @@ def place_cameras(gaussians: Gaussians, num_views: int = NUM_VIEWS) -> Cameras:
     viewmats = _candidate_viewmats(centre, half)
     candidates = Cameras(viewmats, np.repeat(_square_intrinsics(PROBE)[None], len(viewmats), 0), PROBE, PROBE)
     shares = _shares_seen(sample, candidates, NEAR_PLANE_SHARE * float(np.sqrt((half * half).sum())))
-    least_gain = 1e-3  # a camera is added if it raises the opacity shown so far by more than this share
+    least_gain = 1e-3  # a camera is added if it raises the opacity that all chosen cameras show by more than this share
     best = _choose_candidates(shares, num_views, least_gain)
     size = int(np.clip(round(math.sqrt(len(gaussians))), SMALLEST_PIXELS, LARGEST_PIXELS))
     return Cameras(viewmats[best], np.repeat(_square_intrinsics(size)[None], len(best), 0), size, size)
@@ -235,7 +237,10 @@ def _robust_box(means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _candidate_viewmats(centre: np.ndarray, half: np.ndarray) -> np.ndarray:
-    """Return the world-to-camera matrices ``[c,4,4]`` of all candidates around and inside a box."""
+    """Return the world-to-camera matrices ``[c,4,4]`` of all candidates around and inside a box.
+
+    ``centre [3]`` is the centre of the box, and ``half [3]`` are half its sides.
+    """
     grid = np.stack(np.meshgrid(INSIDE, INSIDE, INSIDE, indexing="ij"), -1).reshape(-1, 3)
     inside = [
         _look_along(centre + position * half, direction)
@@ -246,16 +251,20 @@ def _candidate_viewmats(centre: np.ndarray, half: np.ndarray) -> np.ndarray:
 
 
 def _viewmats_around(centre: np.ndarray, half: np.ndarray, radii: float, directions: np.ndarray) -> np.ndarray:
-    """Return world-to-camera matrices ``[c,4,4]`` of cameras in ``directions [c,3]`` that look at a box's centre.
+    """Return world-to-camera matrices ``[c,4,4]`` of cameras that look at a box's centre from ``directions [c,3]``.
 
-    ``half [3]`` are half the sides of the box. The cameras' distance is ``radii`` times half its diagonal.
+    ``half [3]`` are half the sides of the box. The distance of the cameras from the centre is ``radii`` times half the
+    diagonal of the box.
     """
     distance = radii * float(np.sqrt((half * half).sum()))
     return np.stack([_look_along(centre + distance * direction, -direction) for direction in directions])
 
 
 def _viewmats_on_walk(middle: np.ndarray, half: np.ndarray, count: int) -> np.ndarray:
-    """Return the world-to-camera matrices ``[count,4,4]`` of cameras along the longest axis that look to all sides."""
+    """Return world-to-camera matrices ``[count,4,4]`` of cameras that look to all sides along a box's longest axis.
+
+    ``middle [3]`` is the centre of the box, and ``half [3]`` are half its sides.
+    """
     _, side, along = np.eye(3)[np.argsort(half, kind="stable")]
     steps = 2 * (np.arange(count) + 0.5) / count - 1
     angles = GOLDEN * np.arange(count)
@@ -286,15 +295,18 @@ def _look_along(eye: np.ndarray, direction: np.ndarray) -> np.ndarray:
 def choose_showing(sample: Gaussians, candidates: Cameras, counting: np.ndarray, least_added: float) -> list[int]:
     """Choose candidates that show as much as possible of the Gaussians in the mask ``counting [n]`` of a sample.
 
-    A further candidate must add more than the share ``least_added`` to what those before it show. The sample is
-    canonical.
+    A further candidate must add more than the share ``least_added`` to the opacity that the chosen candidates show. The
+    sample is canonical.
     """
     shares = _shares_seen(sample, resize_cameras(candidates, PROBE, PROBE), NEAR_PLANE)
     return _choose_candidates(shares[:, counting], NUM_VIEWS, least_added)
 
 
 def _shares_seen(sample: Gaussians, candidates: Cameras, near: float) -> np.ndarray:
-    """Return the part of each Gaussian's opacity that each candidate shows, ``[c,n]`` float32."""
+    """Return the part of each Gaussian's opacity that each candidate shows, ``[c,n]`` float32.
+
+    ``near`` is the depth of the near plane.
+    """
     splats, photos = make_splats(sample), blank_photos(candidates)
 
     def view_shares(view: int) -> np.ndarray:
@@ -307,10 +319,10 @@ def _shares_seen(sample: Gaussians, candidates: Cameras, near: float) -> np.ndar
 
 
 def _choose_candidates(shares: np.ndarray, num_views: int, least_added: float) -> list[int]:
-    """Choose one to ``num_views`` candidates, each of which adds most to the opacity that those before it show.
+    """Choose one to ``num_views`` candidates, each of which adds most to the opacity that the chosen ones already show.
 
-    ``shares [c,n]`` is the result of :func:`_shares_seen`. No more candidates are chosen if each of them would add at
-    most the share ``least_added``.
+    ``shares [c,n]`` is the result of :func:`_shares_seen`. The choice ends when no other candidate would add more than
+    the share ``least_added``.
     """
     seen = np.zeros(shares.shape[1], np.float32)
     candidates: list[int] = []

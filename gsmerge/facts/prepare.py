@@ -42,7 +42,7 @@ class Reference:
 
     name: str  # "photos", or the name of the pictures that replace them
     score_views: tuple[int, ...]  # Views whose pictures results are scored on
-    # True if the scene has no views of its own. Then all views are placed, and no fit sees those for scores
+    # True if the scene has no views of its own, so that all views are placed; no fit sees the views for scores
     placed: bool = False
     # [v,h,w,3] unchanged photos of the input scene, if the run changed some of them
     photo_files: np.ndarray | None = field(default=None, compare=False, repr=False)
@@ -58,7 +58,7 @@ class Prepared:
     """A scene in its canonical frame, as the stages use it, with facts about it."""
 
     input_scene: Scene  # The scene as it was read, in its own world frame, with photos that look like its Gaussians
-    # The canonical scene with pixels. It has every view once, and photos that do not show the scene are replaced
+    # The canonical scene with pixels. The scene has every view once, and photos that do not show it are replaced
     scene: PicturedScene
     frame: Frame  # The canonical frame
     reference: Reference  # Use of the pictures
@@ -71,7 +71,7 @@ class Prepared:
         """Sizes of the scene that the plan depends on."""
         own_views = self.input_scene if self.reference.placed else self.scene  # placed views do not count
         size = measure_size(own_views, rendered=not self.reference.of_views)
-        # Gaussians that fill holes are not in the file and do not count
+        # Gaussians that fill holes do not count, because they are not in the file
         return replace(size, num_gaussians=min(size.num_gaussians, self.input_scene.num_gaussians))
 
     @cached_property
@@ -87,7 +87,7 @@ class Prepared:
 
     @cached_property
     def scene_around(self) -> PicturedScene:
-        """The canonical scene with more renders, from places around its views. A fit to renders needs them."""
+        """The canonical scene with more renders, from places around its views, which a fit to renders needs."""
         return draw_around(self.scene)
 
     def with_cameras(self, cameras: Cameras) -> Prepared:
@@ -97,7 +97,7 @@ class Prepared:
         return replace(self, scene=replace(self.scene, cameras=cameras), moved=True)
 
     def result_views(self) -> Scene:
-        """Return the input scene with the photos that a result should match: corrected and in a common exposure."""
+        """Return the input scene with the corrected photos, in a common exposure, that a result should match."""
         return _with_photos(self.input_scene, self.scene, self.repeated)
 
     def final_cameras(self) -> Cameras:
@@ -120,10 +120,11 @@ def prepare(
 ) -> Prepared:
     """Collect the facts about a scene that the plan needs; notes name missing data and what replaces it.
 
-    ``frame`` is the canonical frame; None: the scene's own. ``fill``: add Gaussians at pixels that only pictures show.
-    ``outside``: draw pictures of Gaussians that no view sees; False if other views of a larger scene see them.
-    ``pixels``: find the pixels of placed views, which superpixels need. Raises ValueError if there is no finite
-    Gaussian, or if there are images without cameras.
+    ``frame`` is the canonical frame; None stands for the scene's own frame. With ``fill``, Gaussians are added at
+    pixels that only pictures show. With ``outside``, pictures of Gaussians that no view sees are drawn; it is False if
+    the views are a part of a larger scene, whose other views see these Gaussians. With ``pixels``, the pixels of placed
+    views are found, which superpixels need. Raises ValueError if there is no finite Gaussian, or if there are images
+    without cameras.
     """
     options = options or PrepareOptions()
     input_scene, (scene, repeated, notes) = scene, without_repeats(scene)
@@ -187,9 +188,9 @@ def _prepare_pictures(
 ) -> Prepared:
     """Choose the pictures to which results are fitted, and return the prepared scene.
 
-    The first choice are photos that show the scene. Without such photos, the colours of the views' own Gaussians are
-    used. If views have no Gaussians of their own, renders of the scene are used. Views with Gaussians of their own and
-    photos also get one exposure, and poses at which the photos agree.
+    Photos that show the scene are used first. If no photo shows the scene, the colours of the views' own Gaussians are
+    used. If the views have no Gaussians of their own either, renders of the scene are used. Views with Gaussians of
+    their own and photos also get one exposure, and poses at which the photos agree.
     """
     has_own, has_photos = canonical.has_own_pixels, canonical.images is not None
     stand_in = partial(add_row_colors, has_photos=has_photos) if has_own else blank_pictures
@@ -221,7 +222,7 @@ def _with_pictures(
 ) -> tuple[PicturedScene, tuple[int, ...]]:
     """Return a scene with its photos as pictures, and the views whose photos show it.
 
-    If no photo shows it, no views are returned, and ``stand_in`` makes the pictures.
+    If no photo shows the scene, no views are returned, and the function ``stand_in`` makes the pictures.
     """
     if scene.images is not None:
         pictured, views = compare_photos(PicturedScene.with_pictures(scene, scene.images, scene.masks), look)
@@ -231,7 +232,7 @@ def _with_pictures(
 
 
 def without_repeats(scene: Scene) -> tuple[Scene, list[int], list[str]]:
-    """Return a scene without repeated views, the index in it of every input view, and notes on the repeated ones."""
+    """Return a scene without repeated views, every input view's index in this scene, and notes on repeated views."""
     views, repeated = distinct_views(scene)
     count = len(scene) - len(views)
     if not count:
@@ -242,7 +243,7 @@ def without_repeats(scene: Scene) -> tuple[Scene, list[int], list[str]]:
 
 
 def distinct_views(scene: Scene) -> tuple[list[int], list[int]]:
-    """Return the ids of the views that repeat no earlier view, and the index of every view in this list.
+    """Return the ids of the views that repeat no earlier view, and the index of every view in the list of these ids.
 
     Two views are equal if their cameras, photos, masks and Gaussians are equal.
     """
@@ -270,7 +271,7 @@ def _equal_views(scene: Scene, first: int, second: int) -> bool:
 
 
 def views_notes(scene: Scene) -> list[str]:
-    """Return the notes of a run about repeated views and about missing views or photos, without comparing colours."""
+    """Return the notes of a run about repeated views and about missing views or photos; no colours are compared."""
     if len(scene) == 0:
         return [NO_VIEWS if place_inside(scene.gaussians) is None else VIEWER_VIEWS]
     return [*without_repeats(scene)[2], *([NO_PHOTOS] if scene.images is None and scene.is_shown else [])]
@@ -298,7 +299,10 @@ def scored_pictures(scene: Scene) -> tuple[Scene, bool]:
 
 
 def _with_photos(input_scene: Scene, canonical: PicturedScene, repeated: Sequence[int]) -> Scene:
-    """Return the input scene with the pictures and masks of the canonical scene, which has each view once."""
+    """Return the input scene with the pictures and masks of the canonical scene, which has each view once.
+
+    ``repeated`` has the index in the canonical scene of each view of the input scene.
+    """
     if canonical.images is input_scene.images and canonical.masks is input_scene.masks:
         return input_scene
     masks = None if canonical.masks is None else canonical.masks[list(repeated)]

@@ -1,8 +1,8 @@
 """Gaussians and cameras -> support: the number of views that show each Gaussian.
 
 Where no photo shows the scene, behind other surfaces and beyond the borders of the pictures, the Gaussians of a fit are
-guesses. They are invisible from the photos' cameras, but from farther away they look like surfaces. So results can mark
-these Gaussians, leave them out, or show them faintly.
+guesses. Such guesses are invisible from the photos' cameras, but look like surfaces from farther away. The number of
+views tells guesses from other Gaussians, so that results can mark the guesses, leave them out, or show them faintly.
 """
 
 from __future__ import annotations
@@ -17,14 +17,15 @@ from gsmerge.runtime.threads import in_turn
 from gsmerge.settings.fit import FitOptions
 from gsmerge.types import Cameras, Gaussians, make_scene
 
-# A view shows a Gaussian if the Gaussian's blending weight in some pixel is at least this, the least weight in a fit
+# A view shows a Gaussian if the Gaussian's blending weight in some pixel is at least SHOWN_WEIGHT, the least in a fit
 SHOWN_WEIGHT = FitOptions().min_contribution
 
 
 def count_views(gaussians: Gaussians, cameras: Cameras) -> np.ndarray:
     """Count the views that show each of n canonical Gaussians, ``[n]`` int32.
 
-    A view shows a Gaussian if its blending weight is at least 1/255 in some pixel. A fit keeps no Gaussian with less.
+    A view shows a Gaussian if its blending weight is at least 1/255 in some pixel. A fit keeps no Gaussian with smaller
+    weights.
     """
     splats = make_splats(gaussians)
     min_level = 2  # pictures are smaller by at least this factor, as in a fit's survey

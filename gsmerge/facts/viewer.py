@@ -1,7 +1,7 @@
 """Gaussians -> the place of the viewer around whom a scene was made, if it was made around one.
 
 Pixels of a panorama, or of cameras that stand close together, become Gaussians whose sizes are proportional to their
-distance from the viewer. So the sizes determine the viewer's place, whatever the scene shows.
+distance from the viewer. Because of this proportion, the sizes determine the viewer's place, whatever the scene shows.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from gsmerge.kernels.matrices import matmul, solve_symmetric
 from gsmerge.types import Gaussians
 
 GOLDEN = np.pi * (1 + math.sqrt(5))  # angle between successive directions that spreads them evenly
-ALIKE = 0.5  # logarithms of the Gaussians' angles have to vary less than this share of those of their sizes
+ALIKE = 0.5  # the spread of the logarithms of angles, divided by that of the logarithms of sizes, has to be below this
 # A place is likely if its error is at most this multiple of the least error. If a scene is one plane, places on both
 # sides of it have equal errors. Of the likely places, the one with Gaussians in most directions is the viewer's
 LIKELY = 1.1
 CELLS = 100  # cells of directions, half of which the scene has to cover
-# The radius of the empty space around a viewer is the share FREE of a distance. NEAR_SHARE of the Gaussians are nearer
-# than this distance
+# The share NEAR_SHARE of the Gaussians is nearer to a viewer than some distance, of which the radius of the empty space
+# around the viewer is the share FREE
 FREE, NEAR_SHARE = 0.25, 0.05
 
 
@@ -58,21 +58,21 @@ def find_viewer(gaussians: Gaussians) -> Viewer | None:
 
 
 def _look_around(means: np.ndarray, place: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
-    """Return the place, the distances ``[n]`` of Gaussians from it, and the number of cells of directions with some."""
+    """Return a place, the distances ``[n]`` of Gaussians from it, and the number of directions with Gaussians."""
     offsets = means - place
     distances = np.sqrt((offsets**2).sum(1)) + np.finfo(np.float32).tiny
     return place, distances, len(np.unique(matmul(offsets / distances[:, None], spread_directions(CELLS).T).argmax(1)))
 
 
 def _solve_place(means: np.ndarray, sizes: np.ndarray, place: np.ndarray) -> tuple[np.ndarray, float]:
-    """Move a place by Gauss-Newton steps until sizes are nearly proportional to distances; return it and its error.
+    """Move a place by Gauss-Newton steps until sizes are nearly proportional to distances; return place and error.
 
-    The error is the median difference of the logarithms of sizes and distances.
+    The error of a place is the median difference of the logarithms of sizes and distances.
     """
     error = math.inf
     rounds = 8  # number of steps
     doubt_factor = 2.0  # an error gets half the weight if it is this multiple of the median error
-    least_error = 1e-3  # added to this multiple, so that weights are finite if half of the errors are 0
+    least_error = 1e-3  # added to the multiple of the median, so that weights are finite if half of the errors are 0
     for _ in range(rounds):
         offsets = means - place
         distances = np.sqrt((offsets**2).sum(1)) + np.finfo(np.float32).tiny
@@ -88,7 +88,7 @@ def _solve_place(means: np.ndarray, sizes: np.ndarray, place: np.ndarray) -> tup
 def _solve_squares(means: np.ndarray, sizes: np.ndarray) -> np.ndarray:
     """Return the place ``[3]`` at which a quadratic function of the means, fitted to squared sizes, is least.
 
-    The function is size^2 = a |x|^2 + b x + c, fitted with equal relative errors. It is least at -b / 2a.
+    The function is size^2 = a |x|^2 + b x + c, fitted with equal relative errors. The function is least at x = -b / 2a.
     """
     rows = np.concatenate([(means**2).sum(1, keepdims=True), means, np.ones((len(means), 1))], 1) / sizes[:, None] ** 2
     units = np.sqrt((rows**2).mean(0))

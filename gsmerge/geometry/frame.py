@@ -1,8 +1,8 @@
 """Move scenes into and out of their canonical frame, in which all computations run.
 
-Its origin is the scene's middle, and its unit is the median depth. So float32 keeps its precision far from the world's
-origin, and thresholds (near plane, floors) mean the same at every scale. The unit is a power of two, so scaling to the
-frame and back changes no bit.
+The frame's origin is the scene's middle, and its unit is the median depth. In this frame float32 keeps its precision
+far from the world's origin, and thresholds (near plane, floors) mean the same at every scale. The unit is a power of
+two, so scaling to the frame and back changes no bit.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class Frame:
 def scene_frame(scene: Scene) -> Frame:
     """Choose the canonical frame by the median of the means and the median depth.
 
-    The unit is the power of two that is nearest to the depth. Raises ValueError without Gaussians or views.
+    The unit is the power of two that is nearest to the median depth. Raises ValueError without Gaussians or views.
     """
     if len(scene.gaussians) == 0 or len(scene) == 0:
         raise ValueError(f"expected Gaussians and views, got {len(scene.gaussians)} and {len(scene)}")

@@ -55,14 +55,14 @@ def measure_pixel_sizes(means: np.ndarray, homes: np.ndarray, cameras: Cameras) 
     """Measure the width ``[n]`` of a pixel at each of ``means [n,3]``, which is the smallest detail that a photo shows.
 
     ``homes [n]`` are the pixels of the means, numbered over all views; -1 for none. A width is in units of the world,
-    at the depth of the mean in the view of its pixel. For a mean without a pixel, it is the smallest of the widths in
-    all views, at the distance of the mean from the camera.
+    at the depth of the mean in the view of its pixel. For a mean without a pixel, the width is the smallest of the
+    widths in all views, at the distance of the mean from the camera.
     """
     widths, viewmats = np.empty(len(means), np.float32), cameras.viewmats.astype(np.float32)
     focals = np.array([float(np.sqrt(abs(K[0, 0] * K[1, 1]))) for K in cameras.Ks])
 
     def measure_widths(start: int) -> None:
-        """Measure the width of a pixel at some of the means, as if all had a pixel."""
+        """Measure the width of a pixel at some of the means, as if all means had a pixel."""
         rows = slice(start, start + FOOTPRINT_ROWS)
         views = homes[rows] // (cameras.height * cameras.width)
         depths = np.abs(camera_depths(means[rows], viewmats, views))
@@ -108,8 +108,8 @@ def pool_members(members: Members, starts: np.ndarray, ids: np.ndarray, rule: Ru
 
     ``ids [m]`` int32 are rows of ``members``, group after group. ``starts [g+1]`` int64 are the starts of the groups in
     ``ids``. The ``rule`` ``"depth"`` adds the members' own covariances to the covariance of their means, and sums their
-    integrated optical depths. The rule ``"paper"`` is the paper's moment matching (eq. teacher_mean, teacher_cov). The
-    paper states no opacity, so the mean opacity of the members is used.
+    integrated optical depths. The rule ``"paper"`` is the paper's moment matching (eq. teacher_mean, teacher_cov). For
+    the opacity, which the paper does not state, this rule takes the mean opacity of the members.
     """
     num_groups = len(starts) - 1
     pooled = np.zeros((num_groups, POOLED_COLUMNS))
@@ -150,9 +150,10 @@ def principal_axes(covars: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def to_gaussians(covars: np.ndarray, extinctions: np.ndarray, means: np.ndarray, sh: np.ndarray) -> Gaussians:
-    """Convert the moments of g groups to Gaussians; ``sh [g,k,3]`` are all harmonics.
+    """Convert the moments of g groups to Gaussians; ``sh [g,k,3]`` are harmonics of all degrees.
 
-    The opacity follows from the optical depth ``extinctions [g]``, spread over the Gaussian's disc.
+    Moments are ``covars [g,3,3]`` and ``means [g,3]``. The opacity follows from the optical depth ``extinctions [g]``,
+    spread over the Gaussian's disc.
     """
     scales, quats = principal_axes(covars)
     opacities = 1 - exp(-extinctions / (scales[:, 1] * scales[:, 2]))

@@ -1,6 +1,6 @@
 """Compute geometry on batches: quaternions, covariances, projection, harmonics, similarities, motions and regions.
 
-The module also has medians, and damped descent, which solves small problems.
+The module also has medians, and a damped descent, which solves small problems of least squares.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from gsmerge.values.arrays import Array
 
 DescentState = TypeVar("DescentState")  # state that a descent changes
 SH_DIRECTIONS = 96  # directions in which harmonics are compared before and after a rotation
-# To find the median of more than FEW_VALUES values, only the values between two quantiles of a sample are ordered.
-# AROUND_MEDIAN are these quantiles, and SAMPLE_VALUES is about the size of the sample
+# To find the median of more than FEW_VALUES values, only the values between the quantiles AROUND_MEDIAN of a sample are
+# ordered. The sample has about SAMPLE_VALUES values
 FEW_VALUES, SAMPLE_VALUES, AROUND_MEDIAN = 1 << 17, 1 << 14, (0.47, 0.53)
 NORMAL_SPREAD = 1.4826  # standard deviation of a normal distribution, divided by its median absolute deviation
-NEAREST_ROWS = 1 << 14  # points per task of a search for the nearest ones
+NEAREST_ROWS = 1 << 14  # points per task of a search for nearest points
 BRIGHT_SH0 = np.float32(20.0)  # harmonic of degree 0 so large that no colour is clipped at 0
 
 
@@ -55,7 +55,7 @@ def normalize(vectors: np.ndarray) -> np.ndarray:
 def rotmat_to_quat(rotations: np.ndarray) -> np.ndarray:
     """Return unit quaternions ``[n,4]`` wxyz of rotations, with a positive largest component (Shepperd 1978)."""
     a, b, c, d, e, f, g, h, i = rotations.reshape(-1, 9).T
-    candidates = np.stack(  # the same quaternion four times, scaled by each of its components
+    candidates = np.stack(  # one quaternion in four scalings, by each of its components
         [
             np.stack([1 + a + e + i, h - f, c - g, d - b], -1),
             np.stack([h - f, 1 + a - e - i, b + d, c + g], -1),
@@ -95,7 +95,7 @@ def project(means: np.ndarray, cameras: Cameras) -> tuple[np.ndarray, np.ndarray
 
 
 def project_points(points: np.ndarray, viewmats: np.ndarray, Ks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Project points ``[...,n,3]`` as :func:`project` does, but for any leading shape and in their own precision.
+    """Project points ``[...,n,3]`` as :func:`project` does, but for any leading shape and in the points' precision.
 
     ``viewmats [...,4,4]`` are world to camera, ``Ks [...,3,3]`` in pixels. Returns positions ``[...,n,2]`` and depths
     ``[...,n]``.
@@ -114,7 +114,7 @@ def is_inside(pixels: np.ndarray, cameras: Cameras) -> np.ndarray:
 def camera_depths(points: np.ndarray, viewmats: np.ndarray, ids: np.ndarray | None = None) -> np.ndarray:
     """Return the depths ``[...]`` along z of points ``[...,3]`` in cameras ``[...,4,4]``, world to camera.
 
-    ``ids [n]`` choose the camera of each of ``[n,3]`` points.
+    If each of ``[n,3]`` points has a camera of its own, ``ids [n]`` are the numbers of these cameras.
     """
     (x, y, z), (a, b, c, d) = np.moveaxis(points, -1, 0), np.moveaxis(viewmats[..., 2, :], -1, 0)
     if ids is not None:
@@ -166,7 +166,7 @@ def without_common_motion(start: np.ndarray, end: np.ndarray, middle: Callable[.
 def move_views(scene: SceneT, viewmats: np.ndarray) -> SceneT:
     """Return the scene with the cameras at poses ``[v,4,4]``, and each view's Gaussians moved with its camera.
 
-    Higher harmonics are not rotated: poses are off by a degree or two, which hardly changes the colours.
+    Higher harmonics are not rotated, because poses move by a degree or two, which hardly changes the colours.
     """
     g, view_rows = scene.gaussians, scene.get_pixels().rows_of_views
     motions = matmul(invert(viewmats), scene.cameras.viewmats.astype(np.float64))
@@ -195,7 +195,7 @@ def middle_depth(means: np.ndarray, camera: Cameras) -> float:
 
 def depths_inside(means: np.ndarray, camera: Cameras) -> np.ndarray:
     """Return the depths of a sample of the points ``[n,3]`` inside one camera's picture; a single 1.0 for no points."""
-    depth_sample = 50_000  # points; the median depth in a view is measured on about so many
+    depth_sample = 50_000  # number of points; the median depth in a view is measured on about this many
     points = means[:: max(1, len(means) // depth_sample)]
     (pixels,), (depths,) = project(points, camera)
     inside = (depths > 0) & ((pixels >= 0) & (pixels <= (camera.width, camera.height))).all(1)
@@ -207,8 +207,9 @@ def step_outside(
 ) -> np.ndarray:
     """Return the viewmat ``[4,4]`` float64 of a camera that moves around the point in front of it and steps back.
 
-    The camera keeps looking at the point that is ``depth`` in front of it, in world units. ``azimuth`` moves it to the
-    right and ``elevation`` upwards, in degrees. ``back`` is the step away from the point, as a share of ``depth``.
+    The camera keeps looking at the point that is ``depth`` in front of it, in world units. ``azimuth`` moves the camera
+    to the right and ``elevation`` upwards, in degrees. ``back`` is the step away from the point, as a share of
+    ``depth``.
     """
     angles = np.radians([[0.0, azimuth, 0.0], [elevation, 0.0, 0.0]])
     about_y, about_x = motion_matrices(np.concatenate([angles, np.zeros((2, 3))], 1))
@@ -234,10 +235,10 @@ def vector_lengths(vectors: np.ndarray) -> np.ndarray:
 
 
 def find_nearest(points: np.ndarray, count: int, rows: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Find the ``count`` nearest other points of each of ``rows [m]``; return their rows and distances ``[m,count]``.
+    """Find the ``count`` nearest other points of each of ``rows [m]``; return rows and distances ``[m,count]``.
 
     The nearest point comes first. There must be more than ``count`` points ``[n,3]``, all finite. If ``rows`` is None,
-    neighbours of all points are found.
+    the neighbours of all points are found.
     """
     rows = np.arange(len(points)) if rows is None else rows
     others = np.ones(len(points), bool)
@@ -266,7 +267,7 @@ def nearest_views(centres: np.ndarray, view: int) -> np.ndarray:
 
 
 def camera_distances(cameras: Cameras) -> np.ndarray:
-    """Return distances ``[v,v]`` of cameras. Each is the distance of centres plus the distance of unit directions."""
+    """Return distances ``[v,v]`` of cameras: the distance of centres plus the distance of unit viewing directions."""
     viewmats = cameras.viewmats.astype(np.float64)
     centres_and_directions = (camera_centres(viewmats), viewmats[:, 2, :3])
     differences = [vectors[:, None] - vectors[None] for vectors in centres_and_directions]
@@ -276,12 +277,12 @@ def camera_distances(cameras: Cameras) -> np.ndarray:
 def order_others(distances: np.ndarray) -> np.ndarray:
     """Return the other views ``[v,v-1]`` of each view by their distances ``[v,v]``, the nearest first."""
     ordered = distances.copy()
-    np.fill_diagonal(ordered, -1)  # each view is the nearest to itself
+    np.fill_diagonal(ordered, -1)  # so that each view comes first in its own order
     return np.argsort(ordered, axis=1, kind="stable")[:, 1:]
 
 
 def median(values: np.ndarray) -> float:
-    """Return the median of all ``values``; NaN if there are none, or if one is NaN.
+    """Return the median of all ``values``; NaN if there are no values, or if a value is NaN.
 
     ``np.median`` is several times as slow.
     """
@@ -308,7 +309,7 @@ def medians(values: np.ndarray) -> np.ndarray:
 def quantiles(values: np.ndarray, shares: Sequence[float]) -> np.ndarray:
     """Return the quantiles ``[s,...]`` of each column of ``[n,...]`` rows, n >= 1, interpolated as by ``np.quantile``.
 
-    ``shares [s]``, 0 to 1. No value may be NaN.
+    ``shares [s]`` are from 0 to 1. No value may be NaN.
     """
     places = (len(values) - 1) * np.array(shares, np.float64)
     before = np.floor(places).astype(np.int64)
@@ -316,7 +317,7 @@ def quantiles(values: np.ndarray, shares: Sequence[float]) -> np.ndarray:
     ordered = np.partition(values, [*before, *after], axis=0)
     low, high = ordered[before], ordered[after]
     steps = (places - before).reshape(-1, *[1] * (values.ndim - 1))
-    # np.quantile starts from the nearer value, which decides how results are rounded
+    # like np.quantile, start from the nearer of two values, which decides how results are rounded
     return np.where(steps < 0.5, low + (high - low) * steps, high - (high - low) * (1 - steps))
 
 
@@ -374,7 +375,7 @@ def apply_harmonics_rotation(shN: np.ndarray, matrix: np.ndarray) -> np.ndarray:
 def evaluate_harmonics(directions: np.ndarray, num: int) -> np.ndarray:
     """Evaluate the higher harmonics in directions ``[d,3]``; return ``[d,num]`` float64.
 
-    A harmonic is the change of the colour that the kernel for drawing gives a Gaussian in this direction.
+    A harmonic is evaluated as the change of colour that it gives a Gaussian in the kernel for drawing.
     """
     means = directions.astype(np.float32)
     count = len(means)
@@ -406,21 +407,21 @@ def rgb_to_sh0(rgb: np.ndarray) -> np.ndarray:
 def robust_weights(errors: np.ndarray, multiple: float, least: float, units: np.ndarray | float = 1.0) -> np.ndarray:
     """Return Cauchy's weights ``[n]`` for reweighted least squares, which are small for errors far above the median.
 
-    The weights are ``1 / (units^2 (1 + (errors / limit)^2))`` with ``limit = multiple * median + least``. The
-    weights are for residuals in ``units``.
+    The weights are ``1 / (units^2 (1 + (errors / limit)^2))`` with ``limit = multiple * median + least``. Each residual
+    counts as a multiple of its unit in ``units``.
     """
     return np.asarray(1 / (units**2 * (1 + (errors / (multiple * median(errors) + least)) ** 2)))
 
 
 @dataclass(frozen=True)
 class Damping:
-    """Limits of the steps of :func:`descend`, and how their damping changes."""
+    """Limits of the steps of :func:`descend`, and how the damping of steps changes."""
 
     steps: int  # Largest number of steps
     first: float  # Damping of the first step, a share of the curvature
     decrease: float  # Factor on the damping after a step that lowers the error
     increase: float  # Factor on the damping after a step that does not lower the error
-    largest: float  # Largest damping; no step is tried beyond it
+    largest: float  # Largest damping; no step is tried with more
     min_gain: float  # Share of the error that a step must remove for another step to follow
 
 
@@ -432,7 +433,7 @@ def descend(
 ) -> DescentState:
     """Take damped steps that each lower the error, by Levenberg and Marquardt's rule, and return the last state.
 
-    ``step`` takes a state and the amount of damping, and returns the next state, or None if there is none.
+    ``step`` takes a state and the amount of damping, and returns the next state, or None if the step fails.
     """
     state, amount = start, damping.first
     least_error = error(state)
@@ -468,7 +469,7 @@ class Similarity:
         return np.asarray(self.scale * matmul(points, self.rotation.T) + self.shift)
 
     def move_gaussians(self, g: Gaussians) -> Gaussians:
-        """Move Gaussians from the frame of the cameras into their own, with their harmonics."""
+        """Move Gaussians, with their harmonics, from the frame of cameras into the frame of Gaussians."""
         return Gaussians(
             means=self.move_points(g.means).astype(g.means.dtype),
             quats=multiply_quats(rotmat_to_quat(self.rotation[None])[0], g.quats).astype(g.quats.dtype),
@@ -503,7 +504,7 @@ def move_region(region: Region, origin: np.ndarray, unit: float) -> Region:
 def lies_inside(region: Region, points: np.ndarray) -> np.ndarray:
     """Return a mask ``[n]`` of the ``points [n,3]`` inside a region, border included."""
     local = matmul(points - region.middle, region.axes.T)
-    # by which rounding may move points on the border
+    # distance by which rounding may move points on the border
     tolerance = 4 * float(np.finfo(np.float64).eps) * (np.abs(region.middle).max() + region.half.max())
     if region.is_sphere:
         return np.asarray(np.square(local).sum(1) <= (region.half[0] + tolerance) ** 2)
@@ -513,7 +514,7 @@ def lies_inside(region: Region, points: np.ndarray) -> np.ndarray:
 def clamp_inside(region: Region, points: np.ndarray) -> np.ndarray:
     """Return ``points [n,3]`` in float64, where points outside a region are moved to its border."""
     local = matmul(points - region.middle, region.axes.T)
-    # a little smaller, so that points are still inside after they are rounded
+    # sides a little smaller than the region's, so that points are still inside after they are rounded
     half = np.maximum(region.half - region.rounding, region.half / 2)
     if region.is_sphere:
         lengths = np.sqrt(np.square(local).sum(1, keepdims=True))
@@ -526,7 +527,7 @@ def clamp_inside(region: Region, points: np.ndarray) -> np.ndarray:
 def fit_similarity(start: np.ndarray, end: np.ndarray, scale: float = 1.0) -> Similarity:
     """Fit the similarity that maps cameras ``start [c,4,4]`` (world to camera) to ``end``, by least squares.
 
-    If all cameras stand in one place, they do not determine the scale, and ``scale`` is used.
+    If all cameras stand in one place, which does not determine the scale, ``scale`` is used.
     """
     rotation = closest_rotation(matmul(end[:, :3, :3].swapaxes(1, 2), start[:, :3, :3]).sum(0))
     a, b = matmul(camera_centres(start), rotation.T), camera_centres(end)

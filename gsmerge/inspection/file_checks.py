@@ -29,7 +29,7 @@ CAMERA_FILE_ENDINGS = (*CAMERA_ENDINGS, ".bin")
 
 @dataclass(frozen=True)
 class FileCheck:
-    """Content of a file, and the reasons to refuse it."""
+    """Content of a file, and the reasons to refuse the file."""
 
     path: str
     kind: str  # "Gaussians", "cameras", "networks" or "Feature Gaussians"; "" if the file cannot be read
@@ -56,8 +56,8 @@ class FileCheck:
 def check_content(path: Path, *, opacity: OpacityChoice = "auto", hints: ReadHints = NO_HINTS) -> FileCheck:
     """Read a scene, a file of cameras or networks, or a ``.gsm`` completely, and return what it holds.
 
-    The ending decides the kind of file. A scene is read as ``compact`` reads it, with cameras and photos. A file that
-    cannot be read is returned with its problem. UsageError if a package is missing.
+    The ending of the path decides the kind of file. A scene is read as ``compact`` reads it, with cameras and photos. A
+    file that cannot be read is returned with its problem. UsageError if a package is missing.
     """
     try:
         file_check = _read_scene(path, opacity, hints) if holds_scene(path) else _read_other(path)
@@ -68,7 +68,7 @@ def check_content(path: Path, *, opacity: OpacityChoice = "auto", hints: ReadHin
 
 
 def holds_scene(path: Path) -> bool:
-    """Return whether a path is read as a scene. Otherwise it holds cameras, networks, levels of detail or a state."""
+    """Return whether a path is read as a scene, and not as cameras, networks, levels of detail or a state."""
     if STATE.names(path):
         return os.path.isfile(path) and not holds_features(path)
     return os.path.isdir(path) or may_hold_gaussians(path)
@@ -110,7 +110,7 @@ def _read_levels(path: Path) -> FileCheck:
     """Read all levels of detail of an index, one after the other."""
     index = streamed.read_index(path)
     infos = [streamed.read_level(path, level, index).info for level in range(len(index.levels))]
-    # The bytes of every level include the index
+    # The index counts in the bytes of every level
     total_bytes = sum(info.file_bytes for info in infos) - (len(infos) - 1) * path.stat().st_size
     notes = dict.fromkeys(note for info in infos for note in file_notes(info))
     return FileCheck(str(path), "Gaussians", infos[0].count, infos[0].layout, total_bytes, notes=tuple(notes))

@@ -53,7 +53,7 @@ _UNKNOWN_KEYS = (
     "camera_format", "rows", "alignment", "alignment_problem", "sight", "compact", "auto", "agreement", "num_unseen",
 )  # None unless the views are known  # fmt: skip
 _CAMERA_ELEMENTS = ("extrinsic", "intrinsic", "image_size")  # elements of a .ply that hold its camera
-_REPEATED = "read as: "  # beginning of notes that repeat the line "rows"
+_REPEATED = "read as: "  # beginning of notes that say the same as the line "rows"
 _ENCODINGS = {"logit": "as logits", "raw": "in [0, 1]"}  # words for the encodings of opacities
 
 
@@ -148,7 +148,7 @@ def _prepare_quietly(scene: Scene) -> tuple[Scene, list[str]]:
 
 
 def _describe_auto(scene: Scene, agreement: Agreement | None) -> dict[str, Any] | None:
-    """Describe the number of Gaussians of an automatic budget; None if the depths of views cannot be compared."""
+    """Describe the number of Gaussians that ``--budget auto`` gives; None if the depths of views cannot be compared."""
     if agreement is None:
         return None
     count = int(agreement.share * scene.num_gaussians)
@@ -189,7 +189,10 @@ def _describe_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> d
 
 
 def _describe_scene(load: Loaded, *, is_result: bool) -> dict[str, Any]:
-    """Describe a scene that was read: its views, and the result that ``compact`` would make."""
+    """Describe a scene that was read: its views, and the result that ``compact`` would make.
+
+    ``is_result`` is True for results of gsmerge, which have no exporter but perhaps unseen Gaussians.
+    """
     scene = load.scene
     distinct = without_repeats(scene)[0]  # each view once, as in a run
     canonical, run_notes = _prepare_quietly(distinct)
@@ -221,8 +224,8 @@ def _describe_sight(scene: Scene) -> dict[str, Any]:
 def _count_unseen(load: Loaded) -> dict[str, Any]:
     """Count the Gaussians of a result that no view shows; {} if this number would mean nothing.
 
-    It means nothing without views. It also means nothing if there is a Gaussian for each pixel, because Gaussians of
-    overlapping views hide each other.
+    The number means nothing without views. It also means nothing if there is a Gaussian for each pixel, because
+    Gaussians of overlapping views hide each other.
     """
     if len(load.scene) == 0 or load.recovery is not None:
         return {}
@@ -354,7 +357,7 @@ def _agreement_lines(scene: Mapping[str, Any]) -> list[str]:
 
 
 def _new_views_lines(scene: Mapping[str, Any]) -> list[str]:
-    """Describe the PSNR that new views of a result are expected to gain."""
+    """Describe the PSNR that new views are expected to gain in a result, compared with its input."""
     expected = scene["new_views"]
     if expected is None:
         return []

@@ -1,14 +1,14 @@
 """Assign photos to views: find which photo shows which view, and in which orientation.
 
-File names propose a photo for each view. The photo is then compared with the Gaussians of the view. A proposed photo is
+File names propose a photo for each view. A proposed photo is compared with the Gaussians of its view. The photo is
 replaced or left out
 
 - if another photo or another orientation matches the view clearly better,
 - if it matches the view no better than photos match views that they do not show (wrong pairs), or
 - if its parts lie farther from their places than the parts of the other proposed photos do.
 
-For each view that is left without a photo, the photos with the highest scores are compared part by part. This tells
-neighbouring views apart, because their photos show the same things in different places.
+For each view that is left without a photo, the photos with the highest scores are compared part by part. Parts tell
+neighbouring views apart, because photos of neighbours show the same things in different places.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from gsmerge.runtime.threads import parallel_map
 SIGNIFICANT = 2.0  # standard deviations of noise; smaller scores and smaller differences of scores count as noise
 MIN_EXPLAINED = 0.5  # a photo that explains more than this share of the variance of a view matches the view
 MIN_CONTRAST = 1 / 255  # root mean square, the rounding of 8 bits; pictures with less contrast cannot be compared
-FIRST_PHOTOS = 256  # evenly spaced photos of a film that are compared first; then the neighbours of the best ones
+FIRST_PHOTOS = 256  # evenly spaced photos of a film that are compared first; then the neighbours of the best
 
 
 class Assignment(NamedTuple):
@@ -53,7 +53,7 @@ class Candidates:
 
 @dataclass(frozen=True, eq=False)
 class _Scores:
-    """Scores of p photos in all views and orientations: Fisher's z, in units of the noise of wrong pairs."""
+    """Scores of p photos in all views and orientations: Fisher's z, divided by the noise of wrong pairs."""
 
     photos: tuple[int, ...]  # the p photos, in the order of the second axis
     # [v,p,8] scores; NaN for views without Gaussians, and where an oriented photo is portrait but the views are
@@ -62,7 +62,7 @@ class _Scores:
     correlations: np.ndarray  # [v,p,8] correlations from which the scores follow
 
     def of(self, view: int, assignment: Assignment) -> float:
-        """Return the score of an assigned photo in a view; NaN if only one of the two is portrait."""
+        """Return the score of an assigned photo in a view; NaN if only the photo or only the view is portrait."""
         return float(self.values[view, self.photos.index(assignment.photo), assignment.orientation])
 
     def has_shape(self, assignment: Assignment) -> bool:
@@ -70,14 +70,15 @@ class _Scores:
         return bool(np.isfinite(self.values[:, self.photos.index(assignment.photo), assignment.orientation]).any())
 
     def best(self) -> np.ndarray:
-        """Return the score ``[v,p]`` of each photo in its best orientation."""
+        """Return the score ``[v,p]`` of each photo in each view, in the best orientation."""
         return np.nan_to_num(self.values, nan=-np.inf).max(2)
 
     def choose_orientation(self, view: int, photo: int, tag: int) -> int:
         """Choose the orientation in which a photo shows a view.
 
-        The stored orientation, 0, is chosen unless another one scores clearly higher. Then ``tag`` is chosen, unless
-        another one scores clearly higher than ``tag``. The last choice is the orientation with the highest score.
+        The stored orientation, 0, is chosen if no other scores clearly higher. Next, ``tag`` is chosen if no other
+        orientation scores clearly higher than ``tag``. If neither the stored orientation nor ``tag`` is chosen, the
+        result is the orientation with the highest score.
         """
         scores = np.nan_to_num(self.values[view, self.photos.index(photo)], nan=-np.inf)
         proposed = (orientation for orientation in (0, tag) if scores[orientation] > scores.max() - SIGNIFICANT)
@@ -88,7 +89,7 @@ class Assigner:
     """Assign photos to the views of a scene, and cache all comparisons.
 
     ``show(side)`` makes pictures of the views with ``side`` pixels on the longer side. Small pictures are compared
-    first, larger ones where the small ones do not decide.
+    first, and larger pictures where small pictures do not decide.
     """
 
     def __init__(self, show: Callable[[int], ViewPictures], candidates: Candidates) -> None:
@@ -111,7 +112,7 @@ class Assigner:
         task_size = max(min_per_task, -(-len(new) // max_tasks))
 
         def correlate_task(start: int) -> np.ndarray:
-            """Return the correlations of the photos of one task."""
+            """Return the correlations of the photos that one task compares, from the index ``start`` on."""
             return self._comparer.correlate([self.candidates.read(photo) for photo in new[start : start + task_size]])
 
         new_correlations = parallel_map(correlate_task, range(0, len(new), task_size))
@@ -124,8 +125,8 @@ class Assigner:
     def compare_parts(self, view: int, assignment: Assignment) -> float | None:
         """Compare a photo with a view part by part, and return their similarity.
 
-        It is at least 1 if the photo shows the view, 0 if the photo was taken from elsewhere, and None if the parts do
-        not decide.
+        The similarity is at least 1 if the photo shows the view, 0 if the photo was taken from elsewhere, and None if
+        the parts do not decide.
         """
         offsets = self.find_offsets(view, assignment)
         if offsets is None or offsets.verdict is None:
@@ -142,7 +143,7 @@ class Assigner:
     def is_displaced(self, view: int, assignments: Mapping[int, Assignment]) -> bool:
         """Return True if the parts of a view's photo are displaced farther than the parts of the other views' photos.
 
-        Wrong depth displaces the drawn Gaussians of all views. So parts of the photo may be displaced by twice the
+        Because wrong depth displaces the drawn Gaussians of all views, parts of the photo may be displaced by twice the
         median offset in the other views, but by no more than ``NEAR_PIXELS``.
         """
         offsets = self.find_offsets(view, assignments[view])
@@ -157,7 +158,7 @@ class Assigner:
         return replace(offsets, tolerance=ZERO_OFFSET + min(threshold, NEAR_PIXELS)).verdict is False
 
     def confirm(self, named: Sequence[int | None], *, exact: bool) -> tuple[list[Assignment | None], list[bool]]:
-        """Check the photos ``named``, which file names or order propose for the views; None for a view without one.
+        """Check the photos ``named``, which file names or order propose for the views; None for no proposal.
 
         Returns two lists with an entry for each view: the assignment, or None if no photo is proposed or the photo is
         rejected; and whether the comparison confirms the photo. A photo is rejected
@@ -166,11 +167,11 @@ class Assigner:
         - if it scores no higher than wrong pairs do, or
         - if its parts lie farther from their places than the parts of the other proposed photos do.
 
-        Noisy Gaussians lower the scores of all photos and displace their parts. The thresholds therefore follow from
-        the scores and parts of the proposed photos themselves.
+        Noisy Gaussians lower the scores of all photos and displace the parts of photos. The thresholds of rejection
+        therefore follow from the scores and parts of the proposed photos themselves.
 
-        If names are ``exact``, a photo is confirmed if its score is high and no other assignment scores higher. All
-        other photos are confirmed if their parts lie in their places.
+        If names are ``exact``, a photo is confirmed if its score is high and no other assignment scores higher. A photo
+        that is not confirmed by its score is confirmed if its parts lie in their places.
         """
         out, confirmed = list[Assignment | None]([None] * len(named)), [False] * len(named)
         named_pairs = [(view, photo) for view, photo in enumerate(named) if photo is not None]
@@ -183,7 +184,7 @@ class Assigner:
         own = np.nan_to_num([scores.of(*pair) for pair in proposed.items()], nan=-np.inf)  # of photos in their views
         matched = _match_columns(best)
         with_contrast = own[self.has_contrast[list(proposed)]]
-        # wrong pairs score about 0, and right ones about the median, so the threshold may lie in the middle
+        # wrong pairs score about 0, and right pairs about the median, so a threshold half way separates them
         least = min(SIGNIFICANT, median(with_contrast) / 2) if _exceed_noise(with_contrast) else SIGNIFICANT
         for row, (view, assignment) in enumerate(proposed.items()):
             score, highest = own[row], max(best[row, row], best[row, matched[row]])
@@ -231,7 +232,7 @@ class Assigner:
         return tag if tagged > stored + SIGNIFICANT else 0
 
     def search(self, views: Sequence[int], photos: Sequence[int]) -> dict[int, Assignment]:
-        """Find which of ``photos`` show ``views``, and return the assignment of each view that has such a photo.
+        """Find which of ``photos`` show ``views``, and return the assignment of each view that a photo shows.
 
         The photos with the highest scores in a view are compared with it part by part.
         """
@@ -242,7 +243,7 @@ class Assigner:
         scores = self.score_in_views(self._correlations)
 
         def compare(pair: tuple[int, Assignment]) -> float:
-            """Return the similarity of the parts, or a number below 1 that follows the score if they do not decide."""
+            """Return the similarity of parts, or if parts do not decide, a number below 1 that follows the score."""
             similarity = self.compare_parts(*pair)
             if similarity is not None:
                 return similarity
@@ -294,7 +295,7 @@ def assign_photos(
         show: ``show(side)`` makes pictures of the views with ``side`` pixels on the longer side.
         candidates: The photos.
         named: The photo that names or order propose for each view, or None.
-        exact: The proposal is by names. If most names prove right, a view without a photo of its name gets none,
+        exact: The proposal is by names. If most names prove right, a view without a photo of its name gets no photo,
             because all photos have names of other views.
         stored: The photos as stored in their files, if ``candidates`` are resampled to the views.
 
@@ -324,7 +325,7 @@ def assign_photos(
 def _exceed_noise(scores: np.ndarray) -> bool:
     """Return True if the median of scores ``[n]`` is significantly above 0, the median of wrong pairs.
 
-    The median is used because a single extreme score hardly moves it.
+    The test uses the median, because a single extreme score hardly moves a median.
     """
     return bool(len(scores) and median(scores) * np.sqrt(len(scores)) > SIGNIFICANT)
 
@@ -350,14 +351,14 @@ def _choose_assignments(pairs: Sequence[tuple[int, Assignment]], scores: Sequenc
 def _match_columns(scores: np.ndarray) -> np.ndarray:
     """Choose a column ``[r]`` for each row of ``scores [r,c]``, so that the sum of the chosen scores is largest.
 
-    No column is chosen twice. A row that gets no column has -1.
+    No column is chosen twice. The result is -1 for a row that gets no column.
     """
     best, out = scores.argmax(1), np.full(len(scores), -1)
     if len(set(best.tolist())) == len(best):  # the best columns differ, so no search is needed
         return np.asarray(best)
     from scipy.optimize import linear_sum_assignment  # here because it takes long to load
 
-    impossible_cost = 1e6  # cost of a pair whose shapes differ
+    impossible_cost = 1e6  # cost of a photo and a view whose shapes differ
     rows, columns = linear_sum_assignment(np.where(np.isfinite(scores), -scores, impossible_cost))
     out[rows] = columns
     return out

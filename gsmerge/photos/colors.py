@@ -1,10 +1,10 @@
 """Test whether a change of colours makes photos equal to what the Gaussians show.
 
 A change exchanges red and blue, applies a tone curve to each channel, or is a linear map of colours. Pictures are cut
-into blocks, half of which are black and half white like the squares of a chess board. The change of one half is fitted
-to the other half, so no block is scored by a change that was fitted to it. A change is accepted if it reduces the
-errors of blocks by more than their noise and by more than half. The error of a block is the error of its mean colour,
-because wrong depth displaces few Gaussians across a block.
+into blocks, half of which are black and half white like the squares of a chess board. The change for the black blocks
+is fitted to the white blocks, and the other way round, so no block is scored by a change that was fitted to this block.
+A change is accepted if it reduces the errors of blocks by more than their noise and by more than half. The error of a
+block is the error of its mean colour, because wrong depth displaces few Gaussians across a block.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ class Blocks:
     solid: np.ndarray  # [v,H,W] True where a block is opaque enough to be compared
 
     def errors(self, views: Sequence[int] | slice = slice(None)) -> np.ndarray:
-        """Return the mean difference ``[n]`` between photo and picture in each block of ``views``; NaN if faint."""
+        """Return the mean difference ``[n]`` of photo and picture in each block of ``views``; NaN in faint blocks."""
         return self.distances(self.pictures, views)
 
     def distances(self, colors: np.ndarray, views: Sequence[int] | slice = slice(None)) -> np.ndarray:
-        """Return the mean difference ``[n]`` between photo and ``colors [v,H,W,3]`` in each block; NaN if faint."""
+        """Return the mean difference ``[n]`` of photo and ``colors [v,H,W,3]`` in each block; NaN in faint blocks."""
         differences = np.abs(self.photos - colors).mean(-1)
         return np.where(self.solid, differences, np.nan)[views].reshape(-1)
 
@@ -54,7 +54,10 @@ def is_visible(errors: np.ndarray) -> bool:
 
 
 def explains(before: np.ndarray, after: np.ndarray) -> bool:
-    """Return True if a change reduces the errors of blocks ``[n]`` significantly and halves their sum of squares."""
+    """Return True if a change reduces the errors of blocks ``[n]`` significantly, from ``before`` to ``after``.
+
+    The change also has to halve the sum of the squared errors.
+    """
     return stands_out(before - after) and _sum_squares(before) > 2 * _sum_squares(after)
 
 
@@ -72,7 +75,7 @@ def cut_blocks(pairs: Pairs) -> Blocks:
 def fit_tones(colors: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Fit a tone curve ``[3,256]`` that maps the quantiles of ``colors`` to those of ``targets``, channel by channel.
 
-    Wrong depth and noise hardly change quantiles.
+    Colours and targets are ``[n,3]``, with ``weights [n]``. Wrong depth and noise hardly change quantiles.
     """
     return np.stack([_join_quantiles(colors[:, channel], targets[:, channel], weights) for channel in range(3)])
 
@@ -86,7 +89,10 @@ def map_tones(tones: np.ndarray, photo: np.ndarray) -> np.ndarray:
 
 
 def fit_map(colors: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Fit the linear map ``[4,3]`` of colours to targets by least squares; its last row is a constant."""
+    """Fit the linear map ``[4,3]`` of ``colors [n,3]`` to ``targets [n,3]`` by least squares with ``weights [n]``.
+
+    The last row of the map is a constant.
+    """
     columns = np.concatenate([colors, np.ones((len(colors), 1))], 1).astype(np.float64)
     weighted = columns * weights[:, None]
     ridge = 1e-6  # ridge of the least squares, relative to the mean square of colours; keeps maps of grey photos finite
@@ -101,10 +107,10 @@ def map_colors(matrix: np.ndarray, photo: np.ndarray) -> np.ndarray:
 
 
 def vary_in_hue(colors: np.ndarray, weights: np.ndarray) -> float:
-    """Return how much of the colours ``[n,3]`` does not follow from their brightness, weighted by ``weights [n]``.
+    """Measure what part of the colours ``[n,3]`` does not follow from their brightness, weighted by ``weights [n]``.
 
-    This is the root mean square distance to the best tone curve of the grey levels. It is about 0 for grey photos, and
-    for photos of a single tint.
+    The result is the root mean square distance of the colours from the best tone curve of their grey levels. The result
+    is about 0 for grey photos, and for photos of a single tint.
     """
     grey = colors.mean(1, keepdims=True).repeat(3, 1)
     away = (colors - map_tones(fit_tones(grey, colors, weights), grey)) ** 2 * weights[:, None]
@@ -139,19 +145,22 @@ def map_blocks(blocks: Blocks) -> Blocks:
 
 
 def plain_blocks(blocks: Blocks) -> Blocks:
-    """Return the blocks with photos of one colour, the mean colour of the Gaussians; see :func:`_cross_fit`."""
+    """Return the blocks with plain photos in the mean colour of the Gaussians, which is found by :func:`_cross_fit`."""
     plain = _cross_fit(blocks.photos, blocks.pictures, blocks.solid.astype(np.float32), _plain_change)
     return Blocks(plain, blocks.pictures, blocks.solid)
 
 
 def _plain_change(_: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> ChangeColors:
-    """Return the change that gives every pixel the mean of the targets."""
+    """Return the change that gives every pixel the mean of the colours ``targets``."""
     mean = (targets * weights[:, None]).sum(0, dtype=np.float64) / max(float(weights.sum(dtype=np.float64)), 1e-9)
     return partial(np.full_like, fill_value=mean)
 
 
 def _cross_fit(photos: np.ndarray, pictures: np.ndarray, weights: np.ndarray, fit: FitColors) -> np.ndarray:
-    """Change each half of the blocks of photos ``[v,h,w,3]`` by the change that ``fit`` finds for the other half."""
+    """Change the black blocks of photos ``[v,h,w,3]`` as ``fit`` finds for the white blocks, and vice versa.
+
+    ``fit`` maps photos to ``pictures [v,h,w,3]``, with ``weights [v,h,w]``.
+    """
     out, block_side = np.empty_like(photos), max(1.0, max(photos.shape[1:3]) / BLOCKS)
     y, x = ((np.arange(size) / block_side).astype(int) for size in photos.shape[1:3])
     black_squares = (y[:, None] + x) % 2 == 1  # like those of a chess board
@@ -165,7 +174,7 @@ def _cross_fit(photos: np.ndarray, pictures: np.ndarray, weights: np.ndarray, fi
 def _join_quantiles(levels: np.ndarray, tones: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Return the curve ``[256]`` float32 that maps quantiles of ``levels`` to those of ``tones``.
 
-    Levels below and above all quantiles are mapped in proportion.
+    Levels and tones have ``weights [n]``. Levels below and above all quantiles are mapped in proportion.
     """
     used = weights > 0
     if not used.any():

@@ -1,9 +1,9 @@
 """Scene -> the scene with photos that look like its Gaussians, without photos that do not show it.
 
 Photos with another tone (linear light, exposure or gamma) are corrected by a curve for each channel. Photos that do not
-show their views are left out. All photos are left out if they have another look, such as red and blue in the wrong
-order. If a pixel of a photo still differs from the colour of its own Gaussian and from a drawing of its view's
-Gaussians, something covers the scene there. Then the Gaussians' colours are used instead.
+show their views are left out. All photos are left out if their colours have another look, such as red and blue in the
+wrong order. If a pixel of a photo still differs from the colour of its own Gaussian and from a drawing of its view's
+Gaussians, something covers the scene there, and the Gaussians' colours are used at this pixel.
 """
 
 from __future__ import annotations
@@ -57,8 +57,9 @@ def compare_photos(scene: PicturedScene, look: Look = "auto") -> tuple[PicturedS
     """Correct the photos of a canonical scene, and replace photos, or parts of them, that do not show it.
 
     Returns the scene and the views whose photos show it. No view is returned if most photos do not show the scene, or
-    if the photos have another look. With ``look`` "photos", all photos count unchanged. With "scene", none counts. The
-    record gets notes and the choices ``photos_changed`` and ``photos_left_out``.
+    if the photos have another look, such as red and blue in the wrong order. With ``look`` "photos", all photos count
+    unchanged. With ``look`` "scene", no photo counts. The record gets notes and the choices ``photos_changed`` and
+    ``photos_left_out``.
     """
     photo_views = scene.photo_views
     if look != "auto" or not photo_views:
@@ -96,11 +97,12 @@ def compare_photos(scene: PicturedScene, look: Look = "auto") -> tuple[PicturedS
 
 
 def find_tones(pairs: Pairs, views: Sequence[int]) -> list[np.ndarray | None]:
-    """Find, for each view, the tone curve ``[3,256]`` from its photo to its Gaussians; None if their tones are equal.
+    """Find, for each view, the tone curve ``[3,256]`` from its photo to its Gaussians; None if tones are equal.
 
-    If the Gaussians are drawn, all photos share a curve. If no photo changes by more than :data:`EXPOSURE_STEP`, no
-    curve counts, because models have a tone of their own. A curve counts only if the inverse curve, from Gaussians to
-    photos, reduces errors, too. It does not if the cause is noise, which flattens the colours of Gaussians.
+    If the pictures of the Gaussians are drawings, all photos share a curve. If no photo changes by more than
+    :data:`EXPOSURE_STEP`, no curve counts, because models have a tone of their own. A curve counts only if the inverse
+    curve, from Gaussians to photos, reduces errors, too. The inverse curve reduces no errors if photos and Gaussians
+    differ by noise, which flattens the colours of Gaussians.
     """
     curves, is_large = list[np.ndarray | None]([None] * len(pairs)), False
     stored = cut_blocks(pairs)
@@ -120,7 +122,8 @@ def find_tones(pairs: Pairs, views: Sequence[int]) -> list[np.ndarray | None]:
 def find_grey(pairs: Pairs, views: Sequence[int]) -> dict[int, float]:
     """Find the ``views`` whose photos have no hues although their Gaussians have.
 
-    Returns for each of them by how much its hues vary, as a share of the variation of the Gaussians' hues.
+    Returns for each of these views how much the hues of its photo vary, as a share of the variation of the Gaussians'
+    hues.
     """
     hue_sample = 2_000  # approximate number of pixels of a photo whose hues are compared, if it has as many
     shares, step = dict[int, float](), 1 + pairs.photos[0].size // (3 * hue_sample)
@@ -134,7 +137,7 @@ def find_grey(pairs: Pairs, views: Sequence[int]) -> dict[int, float]:
 
 
 def _color_photos(scene: PicturedScene, grey: Mapping[int, float]) -> PicturedScene:
-    """Give grey photos the hues of the Gaussians, but leave their brightness; note which photos are grey.
+    """Give grey photos the hues of the Gaussians, but keep the photos' brightness; note which photos are grey.
 
     ``grey`` is the result of :func:`find_grey`.
     """
@@ -156,8 +159,8 @@ def _color_photos(scene: PicturedScene, grey: Mapping[int, float]) -> PicturedSc
 def have_other_tones(scene: PicturedScene, views: Sequence[int]) -> bool:
     """Return whether the base colours of all Gaussians have another tone than the photos of ``views``.
 
-    The base colours come from the photos, also those of hidden Gaussians. Drawings are a weaker test: if depth is
-    wrong, the Gaussians that hide others can give a drawing another tone.
+    Models take the base colours from the photos, even the colours of hidden Gaussians. Drawings are a weaker test than
+    base colours: if depth is wrong, the Gaussians that hide others can give a drawing another tone.
     """
     solid = np.flatnonzero(scene.gaussians.opacities > COMPARED_OPACITY)
     step = 1 + len(views) * scene.pixels_per_view // TONE_SAMPLE
@@ -174,8 +177,8 @@ def have_other_tones(scene: PicturedScene, views: Sequence[int]) -> bool:
 def _group_by_curve(pairs: Pairs, views: Sequence[int]) -> list[list[int]]:
     """Group the views whose photos share a tone curve.
 
-    If the pictures of the Gaussians are drawings, all views are one group, because drawings show tones less exactly.
-    Otherwise each view is a group of its own.
+    If the pictures of the Gaussians are drawings, all views are one group, because drawings show tones less exactly. If
+    the pictures are the colours of the views' own Gaussians, each view is a group of its own.
     """
     return [list(views)] if pairs.shown.drawn else [[view] for view in views]
 
@@ -185,8 +188,9 @@ def find_matching_views(
 ) -> list[int]:
     """Find which of ``views`` are shown by their ``photos [h,w,3]``; see :mod:`gsmerge.photos.assign`.
 
-    No view is returned if all photos together match no better than photos match other views. Views of one camera share
-    one photo. ``shown`` are small pictures of the Gaussians in all views; if they are drawings, they are reused.
+    No view is returned if all photos together match their views no better than photos match other views. Views of one
+    camera share one photo. ``shown`` are small pictures of the Gaussians in all views, which are reused if they are
+    drawings.
     """
     camera_ids = camera_kinds(scene.cameras)
     ids = sorted({camera_ids[view]: view for view in reversed(views)}.values())  # the first view of each camera
@@ -200,18 +204,18 @@ def find_matching_views(
     confirmed_photos, _ = assigner.confirm(range(len(ids)), exact=True)
     if not assigner.match_together(confirmed_photos):
         return []
-    # views without contrast cannot be compared, so they count as matching
+    # views without contrast count as matching, because they cannot be compared
     results = zip(ids, confirmed_photos, assigner.has_contrast, strict=True)
     matching = {camera_ids[view] for view, photo, has_contrast in results if photo is not None or not has_contrast}
     return [view for view in views if camera_ids[view] in matching]
 
 
 def _has_other_look(scene: PicturedScene, pairs: Pairs, views: Sequence[int]) -> bool:
-    """Return whether a linear map of colours, but no tone curve, explains how the photos differ from Gaussians.
+    """Return whether a linear map of colours, but no tone curve, explains how the photos differ from the Gaussians.
 
-    The map may lead from photos to Gaussians, or from Gaussians to photos, for example to grey ones. Photos of another
-    scene do not count as another look, because photos must match their views after the map, and because the map must
-    explain more than a single colour does. Only ``views`` are compared.
+    The map may lead from photos to Gaussians, or from Gaussians to photos, for example to grey photos. Photos of
+    another scene do not count as another look, because photos must match their views after the map, and because the map
+    must explain more than a single colour does. Only ``views`` are compared.
     """
     view_pairs = pairs[views]
     if _is_mapped(view_pairs):
@@ -246,7 +250,7 @@ def _is_mapped(pairs: Pairs) -> bool:
 def _note_stray(scene: PicturedScene, stray: Sequence[int], photo_views: Sequence[int]) -> bool:
     """Note and record the ``stray`` views, whose photos do not show the scene; return whether other photos are used.
 
-    If more than half of the photos are stray, none is used.
+    If more than half of the photos, those of ``photo_views``, do not show the scene, no photo is used.
     """
     names = [scene.names[view] for view in stray]
     record_choices(photos_left_out=names)
@@ -259,7 +263,7 @@ def _note_stray(scene: PicturedScene, stray: Sequence[int], photo_views: Sequenc
 
 
 def _note_tones(scene: PicturedScene, changes: Sequence[PhotoChange], views: Sequence[int]) -> None:
-    """Note by which factors the tones of the photos of ``views`` change."""
+    """Note by which factors the photos of ``views`` get brighter or darker."""
     toned = {view: curve for view in views if (curve := changes[view].tones) is not None}
     if not toned:
         return
@@ -277,7 +281,7 @@ def _note_hidden(scene: PicturedScene, hidden: np.ndarray, views: Sequence[int])
     """Note in which photos of ``views`` something covers the scene, at the pixels ``hidden [v,h,w]``."""
     with_hidden = [view for view in views if hidden[view].any()]
     max_percent = 100 * max((float(hidden[view].mean()) for view in with_hidden), default=0)
-    noted_percent = 1  # there is no note if less of every photo differs
+    noted_percent = 1  # there is no note if less than this of every photo is covered
     if max_percent < noted_percent:
         return
     note(
@@ -292,13 +296,13 @@ def _find_hidden(scene: PicturedScene, changes: Sequence[PhotoChange]) -> tuple[
     """Find the pixels ``[v,h,w]`` at which something covers the scene in its changed photos.
 
     Also returns pictures ``[v,h,w,3]`` of the colours of the views' own Gaussians. A photo is compared with the base
-    colours of these Gaussians. If it differs somewhere, it is also compared with a drawing of them, which takes longer.
-    Something covers the scene where the photo differs from both. A pixel without a Gaussian takes the result of the
-    nearest pixel with one.
+    colours of its view's Gaussians. A photo that differs somewhere is also compared with a drawing of these Gaussians,
+    which takes longer. Something covers the scene where the photo differs from base colours and drawing. A pixel
+    without a Gaussian takes the result of the nearest pixel with a Gaussian.
     """
 
     def differ(view: int, picture: np.ndarray, known: np.ndarray) -> np.ndarray:
-        """Return the mask of the pixels at which a view's photo differs from a picture that is ``known`` there."""
+        """Return a mask of the pixels at which a view's photo differs from ``picture``, in its ``known`` part."""
         weights = known.astype(np.float32)
         difference = (changes[view](scene.images[view]) - picture) * weights[..., None]
         red, green, blue = np.moveaxis(np.abs(convolve(difference, MEAN_WINDOW, MEAN_WINDOW)), -1, 0)
@@ -306,7 +310,7 @@ def _find_hidden(scene: PicturedScene, changes: Sequence[PhotoChange]) -> tuple[
         return fill_gaps(differs[..., None], known)[..., 0]
 
     def compare_drawn(views: np.ndarray, drawn: RowPicture) -> None:
-        """Compare the photos of ``views`` with a drawing, and replace their pixels in ``hidden`` and ``pictures``."""
+        """Compare the photos of ``views`` with a drawing, and update ``hidden`` and ``pictures`` of these views."""
         for view in views:
             known = shown[view] & inside[view] & drawn.known  # a pixel needs a Gaussian of its own
             pictures[view] = drawn.picture
@@ -330,9 +334,9 @@ def _change_photos(
 ) -> PicturedScene:
     """Change the photos of ``views``, and use the Gaussians' colours at ``hidden [v,h,w]`` pixels and in other views.
 
-    Small and large photos are changed alike. The Gaussians' colours are ``pictures [v,h,w,3]``, or renders if these are
-    None. The pixels of other views count only if each view has Gaussians of its own. ``hidden`` is changed in place:
-    all other views and the pixels outside masks become hidden.
+    Small and large photos are changed alike. The Gaussians' colours are ``pictures [v,h,w,3]``, or renders if
+    ``pictures`` is None. The pixels of views other than ``views`` count only if each view has Gaussians of its own.
+    ``hidden`` is changed in place: all views other than ``views`` and the pixels outside masks become hidden.
     """
     other_views = sorted({*range(len(scene))} - {*views})
     hidden[other_views] = True

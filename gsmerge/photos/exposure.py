@@ -1,15 +1,15 @@
 """Scene -> the scene in one exposure, if the exposures of its photos and Gaussians differ at random.
 
-Cameras choose exposure and white balance for each photo, and models copy them into their Gaussians, so one surface has
-several tones. Pixels of a view are looked up in other views that have Gaussians at the same depth. The ratio of two
-views is the median ratio of the colours of such pixels, in each channel. The gains of all views follow from the ratios
-of all pairs of views by least squares, with a geometric mean of one.
+Cameras choose exposure and white balance for each photo, and models copy both into the colours of their Gaussians, so
+one surface has several tones. Pixels of a view are looked up in other views that have Gaussians at the same depth. The
+ratio of two views is the median ratio, in each channel, of the colours of pixels that show one place. The gains of all
+views follow from the ratios of all pairs of views by least squares, with a geometric mean of one.
 
 Gains are removed if nothing predicts the gain of a new view, so that the mean of all gains is the best guess. Photos
 stay unchanged in two cases, in which the gain can be predicted. First, a camera that meters light makes bright places
-darker, also in new photos. In this case photos with larger gains are not brighter. Second, exposure may drift along a
-video. In this case neighbours have nearly the same gain. In both cases photos of mean exposure would be farther from
-new photos, by 1.5 dB in a video of a kitchen.
+darker, also in new photos. Among photos of a metering camera, photos with larger gains are not brighter. Second,
+exposure may drift along a video, so that neighbouring photos have nearly the same gain. If the gain can be predicted,
+photos of mean exposure would be farther from new photos than unchanged photos are, by 1.5 dB in a video of a kitchen.
 """
 
 from __future__ import annotations
@@ -33,23 +33,24 @@ from gsmerge.types import Cameras, PicturedScene, Scene
 EXPOSURE_PIXELS = 2000  # pixels of a view that are looked up in the other views
 NOISE_LEVEL, CLIPPED_LEVEL = 0.05, 0.95  # colours in between are neither noise nor clipped
 # The bounds from DIFFERENT to UNEXPECTED were chosen on the exports of 15 captures whose exposures were not changed.
-# Exposures differ if the root mean square of the logarithmic gains is above this bound. If five photos get random gains
-# of 0.8 to 1.25, it is above in nine of ten draws. It is also above in six of the captures
+# Exposures differ if the root mean square of the logarithmic gains is above DIFFERENT. If five photos get random gains
+# of 0.8 to 1.25, their root mean square is above DIFFERENT in nine of ten draws. The root mean square is also above
+# DIFFERENT in six of the 15 captures
 DIFFERENT = 0.06
 # Brightness follows gains if the slope of photos' brightness over their gains, both as logarithms, is above FOLLOWS.
-# The slope is 0.61 to 1.11 for random gains of 0.5 to 2. It is at most 0.41 if a camera metered light and gains are 0.1
-# or more. If places differ in brightness by more than the gains, the slope says little. So a camera counts as metering
-# only if gains and the brightness of places have a correlation below OPPOSED, too. This correlation is -0.67 to -0.99
-# for cameras that metered light
+# The slope is 0.61 to 1.11 for random gains of 0.5 to 2, and at most 0.41 if a camera metered light and logarithmic
+# gains are 0.1 or more. If places differ in brightness by more than the gains, the slope says little. A camera
+# therefore counts as metering only if the correlation of gains and the brightness of places is below OPPOSED, too. The
+# correlation of gains and brightness is -0.67 to -0.99 for cameras that metered light
 FOLLOWS, OPPOSED = 0.5, -0.6
-# Gains are unexpected if share_unexpected returns more than this. It returns 0.71 to 1.22 for random gains of 0.5 to 2,
-# and 0.67 for four views in a row. It returns 0.19 to 0.57 if exposure drifts. In that case results lose 1.7 dB or more
-# if gains are removed
+# Gains are unexpected if share_unexpected returns more than UNEXPECTED. For random gains of 0.5 to 2 the function
+# returns 0.71 to 1.22, or 0.67 for four views in a row. If exposure drifts, share_unexpected returns 0.19 to 0.57, and
+# results lose 1.7 dB or more if gains are removed
 UNEXPECTED = 0.69
 COARSE_STEP = 4  # the brightness of a photo is measured on every COARSE_STEP-th pixel of every COARSE_STEP-th row
-BRIGHT_GAIN = 1.15  # clipped pixels do not count in photos with a larger gain than this
+BRIGHT_GAIN = 1.15  # clipped pixels do not count in photos with a gain above BRIGHT_GAIN
 CLIPPED_NEIGHBOURS = 8  # views in which the surfaces of clipped pixels are looked up
-# Numbers of nearest and of farther views with which a view is compared; see choose_partners
+# Numbers of nearest views and of farther views with which a view is compared; see choose_partners
 NEAREST_VIEWS, FARTHER_VIEWS = 6, 2
 
 
@@ -59,7 +60,7 @@ class _Pair:
 
     view: int
     other: int
-    ratios: np.ndarray  # [3] median, over the pixels, of the logarithm of the other view's colour divided by this one's
+    ratios: np.ndarray  # [3] median, over the pixels, of the logarithm of the other view's colour over this view's
     count: int  # number of pixels
 
 
@@ -67,8 +68,9 @@ def equalise_exposure(scene: PicturedScene, views: Sequence[int], exposure: Expo
     """Divide each view's photo and its pixels' Gaussians by the exposure gain of the view, if that is needed.
 
     The photos of ``views`` show the scene; each view has Gaussians of its own. Clipped pixels of brighter photos no
-    longer count if another photo shows their surface unclipped. The record gets a note and the choice ``exposure``, the
-    gain of each view in red, green and blue. If photos differ but stay unchanged, a note says why.
+    longer count if another photo shows their surface unclipped. The record of the run gets a note and the choice
+    ``exposure``, the gain of each view in red, green and blue. If exposures differ but photos stay unchanged, a note
+    says why.
     """
     if exposure == "fixed" or len(views) < 2:
         return scene
@@ -93,7 +95,10 @@ def equalise_exposure(scene: PicturedScene, views: Sequence[int], exposure: Expo
 
 
 def _find_objection(scene: PicturedScene, views: Sequence[int], gains: np.ndarray) -> str:
-    """Return why photos should stay unchanged although their exposures differ; "" if there is no reason."""
+    """Return why photos should stay unchanged although their exposures differ; "" if there is no reason.
+
+    ``gains [v,3]`` are the logarithmic gains of ``views``.
+    """
     view_gains, photos = gains[list(views)], [scene.images[view][::COARSE_STEP, ::COARSE_STEP] for view in views]
     brightness = log(np.maximum([photo.mean((0, 1), dtype=np.float64) for photo in photos], 1 / 255))
     if is_metered(brightness, view_gains):
@@ -113,7 +118,7 @@ def is_metered(brightness: np.ndarray, gains: np.ndarray) -> bool:
     """Return True if the gains look like those of a camera that meters light, and so makes all photos equally bright.
 
     ``brightness [v,3]`` of the photos and ``gains [v,3]`` are logarithms. If gains are random, photos with larger gains
-    are brighter.
+    are brighter; if light was metered, they are not.
     """
     gains, brightness = gains - gains.mean(0), brightness - brightness.mean(0)
     slope = float((gains * brightness).sum() / max((gains * gains).sum(), 1e-12))
@@ -123,8 +128,8 @@ def is_metered(brightness: np.ndarray, gains: np.ndarray) -> bool:
 def share_unexpected(gains: np.ndarray, distances: np.ndarray) -> float:
     """Measure the RMS distance of views' gains from the mean gains of their two nearest views.
 
-    The result is relative to the distance that is expected of random gains, so it is about 1 for random gains and less
-    if neighbours have similar gains. ``gains [v,3]`` are logarithms; ``distances [v,v]`` are those between cameras.
+    The result is divided by the distance that is expected of random gains, so the result is about 1 for random gains
+    and less if neighbours have similar gains. ``gains [v,3]`` are logarithms; ``distances [v,v]`` are between cameras.
     """
     nearest = order_others(distances)[:, :2]
     offsets = gains - gains[nearest].mean(1)
@@ -161,7 +166,7 @@ class _Pixels:
 
 
 def _pixels_of(scene: Scene) -> _Pixels:
-    """Collect the pixels of a scene; those without a Gaussian and those outside masks do not count."""
+    """Collect the pixels of a scene; pixels without a Gaussian and pixels outside masks do not count."""
     shape = len(scene), scene.pixels_per_view
     fronts = scene.get_pixels().fronts.reshape(shape)
     valid = fronts >= 0
@@ -171,14 +176,14 @@ def _pixels_of(scene: Scene) -> _Pixels:
 
 
 def _measure_pairs(scene: PicturedScene, views: Sequence[int]) -> list[_Pair]:
-    """Measure the ratios of colours between those of ``views`` that show the same surfaces."""
+    """Measure the ratios of colours between pairs of ``views`` that show the same surfaces."""
     size, pixels = scene.pixels_per_view, _pixels_of(scene)
     photos = scene.images.reshape(len(scene), size, 3)
     sample = np.random.default_rng(0).permutation(size)[:EXPOSURE_PIXELS]
     partners = choose_partners(camera_distances(scene.cameras[list(views)]))
 
     def measure_view(number: int) -> list[_Pair]:
-        """Measure the ratios between one of ``views`` and its partners."""
+        """Measure the ratios of colours between one of ``views`` and the views with which it is compared."""
         view, pairs = views[number], list[_Pair]()
         rows = sample[pixels.valid[view, sample]]
         min_pixels = 60  # least number of shared pixels from which a ratio is measured
@@ -200,8 +205,8 @@ def _measure_pairs(scene: PicturedScene, views: Sequence[int]) -> list[_Pair]:
 def choose_partners(distances: np.ndarray) -> np.ndarray:
     """Choose the views ``[v,p]``, ascending, with which each view is compared: all others, or p of them.
 
-    ``distances [v,v]`` are those between the cameras. The nearest views share the most surfaces. Farther views, at
-    equal steps of rank, connect groups of cameras.
+    ``distances [v,v]`` are between cameras. The nearest views share the most surfaces. Farther views, at equal steps in
+    the order of distance, connect groups of cameras that stand apart.
     """
     order = order_others(distances)
     if order.shape[1] > NEAREST_VIEWS + FARTHER_VIEWS:
@@ -211,7 +216,7 @@ def choose_partners(distances: np.ndarray) -> np.ndarray:
 
 
 def _solve_gains(pairs: Sequence[_Pair], num_views: int) -> np.ndarray:
-    """Solve for the logarithmic gains ``[v,3]`` of all views, with mean zero; all are zero without pairs."""
+    """Solve for the logarithmic gains ``[v,3]`` of all views, with mean zero; without pairs all gains are zero."""
     matrix, right = np.full((num_views, num_views), 1.0 / num_views), np.zeros((num_views, 3))
     max_weighted_pixels = 1000  # more shared pixels give a pair of views no larger weight
     for pair in pairs:
@@ -226,7 +231,8 @@ def _solve_gains(pairs: Sequence[_Pair], num_views: int) -> np.ndarray:
 def _find_clipped(scene: PicturedScene, gains: np.ndarray) -> np.ndarray:
     """Return a mask ``[v,h,w]`` of clipped pixels of brighter photos whose surface another photo shows unclipped.
 
-    A surface that is clipped in all photos, such as a sky, is not marked, because no photo would show it then.
+    ``gains [v,3]`` are factors of exposure. A surface that is clipped in all photos, such as a sky, is not marked,
+    because otherwise no photo would show it.
     """
     clipped = ((scene.images >= CLIPPED) & (gains[:, None, None] > BRIGHT_GAIN)).any(-1)
     pixels, flat = _pixels_of(scene), clipped.reshape(len(scene), -1)
@@ -245,7 +251,7 @@ def _find_clipped(scene: PicturedScene, gains: np.ndarray) -> np.ndarray:
 
 
 def _divide_by_gains(scene: PicturedScene, gains: np.ndarray) -> PicturedScene:
-    """Divide photos and colours of Gaussians by the gains ``[v,3]``; mask pixels that :func:`_find_clipped` finds."""
+    """Divide photos and colours of Gaussians by ``gains [v,3]``; mask the pixels that :func:`_find_clipped` finds."""
     factors = (1 / gains).astype(np.float32)
     levels = np.arange(256, dtype=np.float32) / np.float32(255)
     changes = [PhotoChange(tones=(factor[:, None] * levels).clip(0, 1)) for factor in factors]

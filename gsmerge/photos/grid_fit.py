@@ -2,7 +2,7 @@
 
 Photos of another shape than their cameras may have bars, or show both eyes of a stereo camera or several pictures side
 by side. If a file has no cameras, its model may have cropped the photos or changed their aspect ratio, and may have cut
-borders off its output. Of these possibilities, the one that best matches the pictures of the Gaussians is chosen.
+borders off its output. The part and the resizing with which photos best match the pictures of the Gaussians are chosen.
 """
 
 from __future__ import annotations
@@ -43,7 +43,8 @@ class PartFit:
     """The part of each photo that its view shows."""
 
     part: Part = WHOLE
-    # The part is stretched to the aspect ratio of this size, because stereo films squeeze pictures; None: not stretched
+    # The part is stretched to the aspect ratio of the size ``shape``, because stereo films squeeze pictures; None: not
+    # stretched
     shape: Size | None = None
 
     def cut(self, photo: np.ndarray) -> np.ndarray:
@@ -60,7 +61,7 @@ class PartFit:
         return round(scale * self.shape[0]), round(scale * self.shape[1])
 
     def describe(self, size: Size, *, bars: bool) -> str:
-        """Return a note on which part of photos of a ``size`` is used; ``bars`` means that only bars are cut off."""
+        """Return a note on which part of photos of a ``size`` is used; with ``bars``, only bars are cut off."""
         photo_text, part = "{} x {}".format(*size), part_size(size, self.part)
         part_text, ratio = "{} x {}".format(*part), self.stretch(part)[0] * part[1] / (part[0] * self.stretch(part)[1])
         if bars:
@@ -78,9 +79,9 @@ WHOLE_FIT = PartFit()
 def list_parts(size: Size, shape: Size | None, inner: Part) -> list[PartFit]:
     """List the parts of photos of a ``size`` that views may show, likely ones first.
 
-    ``inner`` is the part inside of bars. Views have the aspect ratio of ``shape``. Of parts with another aspect ratio,
-    only the whole and its halves are listed; they come last, and are stretched. With None, views may have any aspect
-    ratio, and no part is stretched.
+    ``inner`` is the part inside of bars. Views have the aspect ratio of ``shape``. Of parts with another aspect ratio
+    than ``shape``, only the whole and its halves are listed; they come last, and are stretched. If ``shape`` is None,
+    views may have any aspect ratio, and no part is stretched.
     """
     counts = product(range(1, _TILES + 1), repeat=2)  # columns and lines of tiles
     tiles = [(x / m, y / n, (x + 1) / m, (y + 1) / n) for m, n in counts for y, x in product(range(n), range(m))]
@@ -97,8 +98,9 @@ def list_parts(size: Size, shape: Size | None, inner: Part) -> list[PartFit]:
 def round_to_cameras(inner: Part, size: Size, shape: Size) -> Part:
     """Round the part ``inner`` of photos of a ``size`` to the size ``shape`` of the cameras, or to a multiple of it.
 
-    ``inner`` is the part inside of bars. JPEG files mix the pixels of a block, so its measured size may be wrong by up
-    to a block. The part is returned unchanged if it would change by more, or would not fit into the photos.
+    ``inner`` is the part inside of bars. JPEG files mix the pixels of a block of 8 x 8, so the measured size of
+    ``inner`` may be wrong by up to a block. The part is returned unchanged if rounding would change it by more than a
+    block, or if the rounded part would not fit into the photos.
     """
     width, height = part_size(size, inner)
     times = max(1, round(width / shape[0]))
@@ -118,7 +120,7 @@ def round_to_cameras(inner: Part, size: Size, shape: Size) -> Part:
 
 @dataclass(frozen=True)
 class GridFit:
-    """How a model resized and cropped photos to the grid of pixels whose Gaussians are the rows of a file."""
+    """How a model resized and cropped photos to a grid; the Gaussians of its pixels are the rows of a file."""
 
     size: Size  # size of the grid
     crops: bool = False  # True: resized in proportion and cropped at the centre; False: resized without proportion
@@ -132,7 +134,7 @@ class GridFit:
     def cut(self, photo: np.ndarray) -> np.ndarray:
         """Resize and crop a photo ``[h,w,3]`` of any size to the pixels of the grid.
 
-        If only one of the two is portrait, the photo is turned first, and the result is turned back.
+        If only the photo or only the grid is portrait, the photo is turned first, and the result is turned back.
         """
         (width, height), (left, top) = self.size, self.trim
         if (photo.shape[1] - photo.shape[0]) * (width - height) < 0:
@@ -143,7 +145,7 @@ class GridFit:
     def cameras(self, camera_file: CameraFile, size: Size) -> CameraFile:
         """Return the cameras of the grid as they were before the model cut off borders.
 
-        Their ``photo_map`` is the transform of photos of a ``size``.
+        The ``photo_map`` of these cameras is the transform of photos of a ``size``.
         """
         (left, top), (width, height), Ks = self.trim, self.size, camera_file.Ks.copy()
         assert camera_file.pixel_ids is not None, "estimated cameras are those of pixels"
@@ -160,7 +162,7 @@ class GridFit:
 def _da3_borders(side: int) -> list[int]:
     """List how many pixels Depth Anything 3 may have cut off at each end of a side of which ``side`` pixels are left.
 
-    It cuts off 8 of 256 pixels, rounded down.
+    Depth Anything 3 cuts off 8 of 256 pixels, rounded down.
     """
     return [border for border in range(side) if int(8 / 256 * (side + 2 * border)) == border]
 
@@ -178,7 +180,7 @@ def list_fits(size: Size) -> list[GridFit]:
 def choose_fit(shown: ViewPictures, photos: Sequence[np.ndarray | None], fits: Sequence[FitT]) -> FitT:
     """Choose the fit with which photos ``[h,w,3]`` match the pictures of their views best.
 
-    A later fit is chosen only if it matches significantly better than the ones before.
+    A later fit is chosen only if it matches significantly better than the best of the earlier fits.
     """
     views = [view for view, photo in enumerate(photos) if photo is not None]
 

@@ -53,7 +53,7 @@ NO_MASKS = Masks()
 
 @dataclass(frozen=True, eq=False)
 class MaskFiles:
-    """The mask files of v photos, and how a picture of a photo is cropped to its view."""
+    """The mask files of v photos, and how a picture of the photo's size is cropped to the view."""
 
     photos: tuple[Path | None, ...]  # files of the photos; empty if the photos are inside another file
     turns: Sequence[int]  # orientation of each photo's file, 0 to 7; odd if the photo is stored on its side
@@ -120,7 +120,7 @@ def read_masks(
 ) -> tuple[Masks, list[str]]:
     """Read the masks of a scene's photos; return them and notes.
 
-    If the cameras' file names masks, these are used, and otherwise masks beside the scene. ``stored`` and ``cut`` are
+    Masks that the cameras' file names are used, or if it names none, masks beside the scene. ``stored`` and ``cut`` are
     fields of :class:`MaskFiles`. SceneError if masks are photos.
     """
     paths = photos.paths
@@ -138,7 +138,7 @@ def read_masks(
         notes += unused
 
     def list_by_view(pictures: Sequence[Path | None]) -> list[Path | None]:
-        """List the pictures of existing photos by view; None for a view without a photo."""
+        """List the pictures, one for each photo that exists, by view; None for a view without a photo."""
         of_views = dict(zip(views, pictures, strict=True))
         return [of_views.get(view) for view in range(len(camera_file))]
 
@@ -161,7 +161,8 @@ def _refuse_photos(
 ) -> None:
     """Raise an ``error`` about ``place`` if some mask is a photo for certain, or if most masks may be photos.
 
-    ``place`` is the folder of the masks, or the file that names them.
+    ``place`` is the folder of the masks, or the file that names them. ``option`` is the name of the option for these
+    masks.
     """
     of_views = {view: mask for view, mask in enumerate(masks) if mask is not None}
     doubts = parallel_map(lambda view: _doubt_mask(of_views[view], photos, view), of_views)
@@ -175,8 +176,9 @@ def _refuse_photos(
 def _doubt_mask(mask: Path, photos: PhotoArrays, view: int) -> float:
     """Return infinity if a mask is a photo for certain, 1 if it may be a photo, and 0 otherwise.
 
-    A picture of several colours is a photo for certain. A grey picture may be a photo if it changes from pixel to
-    pixel as the photo of its view does. But if most of its pixels have one of two levels, it is a mask with soft edges.
+    A picture of several colours is a photo for certain. A grey picture may be a photo if it changes from pixel to pixel
+    as the photo of its view does. If most pixels of a picture have one of two levels, it is a mask with soft edges and
+    no photo.
     """
     picture = np.rint(decode_small(mask, OFFSET_PIXELS) * _WHITE)
     spread = np.ptp(picture, axis=-1)
@@ -198,7 +200,7 @@ def _doubt_mask(mask: Path, photos: PhotoArrays, view: int) -> float:
 def _texture(grey: np.ndarray) -> float:
     """Return the share of pixels that differ by more than a level of 255 from the mean of their two neighbours.
 
-    The neighbours are those to the left and right.
+    The neighbours of a pixel are the pixels to its left and right.
     """
     bends = np.diff(grey, 2, prepend=grey[:, :1], append=grey[:, -1:])
     return float((np.abs(bends) > 2).mean())
@@ -242,11 +244,11 @@ def _find_masks_of_cameras(camera_file: CameraFile) -> tuple[list[Path | None], 
 
 
 def check_masks(masks: Masks, files: SceneFiles, pixels: Pixels | None) -> tuple[Masks, list[str]]:
-    """Return the masks that are used, and notes on the share of the photos that they leave out.
+    """Return the masks that are used, and notes on the share of the photos that masks leave out.
 
-    Masks that leave out nearly everything are not used, and raise a SceneError if the user named them. If a folder of
-    masks that the user did not name leaves out most pixels that show Gaussians, the note is a doubt, since the masks
-    may be inverted.
+    Masks that leave out nearly everything are not used, and raise a SceneError if the user named them. If masks that
+    the user did not name leave out most pixels that show Gaussians, the note is a doubt, since the masks may be
+    inverted.
     """
     counts = masks.counts
     if counts is None:

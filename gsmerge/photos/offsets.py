@@ -1,4 +1,4 @@
-"""Search for the parts of a photo in the picture of a view, to decide whether the photo was taken from there.
+"""Search for the parts of a view's picture in a photo, to decide whether the photo was taken from the view's camera.
 
 Pictures of neighbouring views are similar as a whole, but their parts are displaced. Each part of the view's picture is
 searched for around the same place in the photo. The offset of a part counts if its best place stands out from all other
@@ -21,13 +21,13 @@ OFFSET_PIXELS = 256  # pixels of the longer side of both pictures
 PART_PIXELS, MOST_OFFSET = 32, 12  # pixels: side of a part, and largest offset that is searched
 CONTRAST_PIXELS = 30  # pixels: side of the square whose mean is subtracted to get contrast
 TAPS = 64  # size of the Fourier transforms, at least PART_PIXELS + 2 MOST_OFFSET
-ZERO_OFFSET = 1  # pixels: smaller and equal offsets count as zero, since the peak of a correlation is that wide
+ZERO_OFFSET = 1  # pixels: smaller and equal offsets count as zero, since the peak of a correlation has this width
 NEAR_PIXELS = 3  # pixels: parts that move together differ by at most this in their offsets, since their depths differ
 
 
 @dataclass(frozen=True, eq=False)
 class PhotoOffsets:
-    """Offsets of the n parts of a view's picture whose best place in a photo stands out from all other places."""
+    """Offsets of the n parts of a view's picture whose best places in a photo stand out from all other places."""
 
     offsets: np.ndarray  # [n,2] pixels down and right
     similarity: float  # mean of Fisher's z of all parts at offset zero
@@ -40,7 +40,7 @@ class PhotoOffsets:
 
     @property
     def num_in_place(self) -> int:
-        """Number of parts in their places."""
+        """Number of parts whose offset counts as zero."""
         return int((self.distances <= self.tolerance).sum())
 
     @property
@@ -53,8 +53,8 @@ class PhotoOffsets:
     def verdict(self) -> bool | None:
         """True if the photo was taken from the view, False if it was taken from elsewhere, None in doubt.
 
-        The number of parts in place is compared with the number of parts that moved together. The larger one decides if
-        the two differ by more than the standard error of as many tosses of a fair coin.
+        The number of parts in place is compared with the number of parts that moved together. The larger number decides
+        if it exceeds the other by more than the square root of their sum, the standard error of a fair coin's tosses.
         """
         in_place, together = self.num_in_place, self.num_moved_together
         return in_place > together if abs(in_place - together) > np.sqrt(in_place + together) else None
@@ -79,8 +79,8 @@ def correlate_parts(shown: ViewPictures, view: int, photo: np.ndarray) -> np.nda
 def find_offsets(shown: ViewPictures, view: int, photo: np.ndarray) -> PhotoOffsets | None:
     """Search for the parts of a view's picture in an upright ``photo [h,w,3]``, which may have any size.
 
-    ``shown`` are pictures of all views with up to :data:`OFFSET_PIXELS` pixels on the longer side. None if they are too
-    small to be cut into parts.
+    ``shown`` are pictures of all views with up to :data:`OFFSET_PIXELS` pixels on the longer side. None if these
+    pictures are too small to be cut into parts.
     """
     weight = shown.weights[view]
     height, width = weight.shape
@@ -105,7 +105,7 @@ def _correlate_offsets(photo: np.ndarray, picture: np.ndarray, weight: np.ndarra
     corners = [(top, left) for top in rows for left in columns]
 
     def transform_parts(array: np.ndarray, side: int) -> np.ndarray:
-        """Cut out the parts, squares of ``side`` pixels, and return their Fourier transforms."""
+        """Cut the parts, squares of ``side`` pixels, out of ``array``, and return their Fourier transforms."""
         parts = np.stack([array[top : top + side, left : left + side] for top, left in corners])
         return np.fft.rfft2(np.moveaxis(parts, -1, 1) if parts.ndim == 4 else parts, (TAPS, TAPS))
 

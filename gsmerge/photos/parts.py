@@ -1,6 +1,7 @@
-"""Photos of another shape, or that do not show their views as a whole -> the part of each that shows its view.
+"""Photos that have another shape than their views, or show more -> the part of each photo that shows its view.
 
-Bars are cut off. Of photos that show both eyes of a stereo camera, or several pictures side by side, one is used.
+Bars are cut off. If photos show both eyes of a stereo camera, or several pictures side by side, one of the pictures is
+used.
 """
 
 from __future__ import annotations

@@ -22,14 +22,14 @@ class PhotoChange:
     tones: np.ndarray | None = None  # [3,256] float32, new value of each level of each channel
     cover: np.ndarray | None = None  # [h,w] bool, pixels that get `colors`
     colors: np.ndarray | None = None  # [h,w,3] sRGB in [0, 1]
-    keeps_brightness: bool = False  # True: covered pixels get only the hue of `colors`; False: also its brightness
+    keeps_brightness: bool = False  # True: covered pixels get only the hue of `colors`; False: its brightness, too
 
     def __bool__(self) -> bool:
         """Return whether the photo changes at all."""
         return self.tones is not None or self.cover is not None
 
     def __call__(self, photo: np.ndarray) -> np.ndarray:
-        """Return a changed photo ``[h,w,3]`` float32 in [0, 1]; it has the size of the cover, or is larger."""
+        """Return a changed photo ``[h,w,3]`` float32 in [0, 1]; photos are as large as the cover, or larger."""
         if self.tones is not None:
             photo = map_tones(self.tones, photo)
         if self.cover is not None and self.colors is not None:
@@ -43,7 +43,7 @@ class PhotoChange:
 
 
 def _enlarge(picture: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Enlarge a picture in [0, 1] as integers, which OpenCV resizes to the same values on every processor."""
+    """Enlarge a picture in [0, 1] as integers, which OpenCV resizes to equal values on every processor."""
     levels = np.rint(255 * picture.astype(np.float32).clip(0, 1)).astype(np.uint8)
     return np.asarray(cv2.resize(levels, shape[1::-1], interpolation=cv2.INTER_LINEAR) / np.float32(255))
 

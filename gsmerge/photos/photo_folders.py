@@ -21,7 +21,7 @@ _MODEL_FOLDERS = {"sparse", "colmap", "distorted"}  # names of folders that have
 
 
 def capture_folder(cameras: Path) -> Path:
-    """Return the folder of a capture: that of its camera file, or the one that has its COLMAP model.
+    """Return the folder of a capture: the folder of its camera file, or the folder that has its COLMAP model.
 
     ``cameras`` is the file or the folder of the model. The model may also be in the folder of the capture itself.
     """
@@ -36,12 +36,12 @@ def find_named_photos(
 ) -> tuple[Path, list[Path], list[Path | None]] | None:
     """Find the folder at or below ``roots`` in which most cameras, and more than ``num_known``, have a photo by name.
 
-    Of folders with equally many photos, the best one is chosen by these criteria in turn: files with the whole names of
-    the cameras, with endings; a place below the first root, which is near the cameras; photos with colours, unlike
-    masks and depths; photos of the cameras' size, or of their shape; photos with more pixels.
+    Of folders with equally many photos, one is chosen by these criteria in turn: files with the whole names of the
+    cameras, with endings; a place below the first root, which is near the cameras; photos with colours, unlike masks
+    and depths; photos of the size of the cameras, or of their shape; photos with more pixels.
 
-    Returns the folder, the photos of this and of the next best folders, and the photo of each camera, None without one.
-    Returns None if there is no such folder.
+    Returns the folder, the photos of this folder and of the next best folders, and the photo of each camera, or None
+    for a camera without a photo. Returns None if no folder has photos by name.
     """
     pools = dict[Path, dict[Path, None]]()  # folder -> photos in it and below
     for root in roots:
@@ -54,7 +54,7 @@ def find_named_photos(
     file_names = {PurePath(name).name for name in camera_file.names}
 
     def rank(folder: Path) -> tuple[Any, ...]:
-        """Return a key by which better folders sort first; it begins with minus the number of cameras with a photo."""
+        """Return a key by which better folders sort first: minus the number of cameras with a photo, then the rest."""
         proposed = propose_images(folder, list(pools[folder]), camera_file.names, count_pixels)
         first = next(filter(count_pixels, filter(None, proposed)), None)
         if first is None:

@@ -1,7 +1,7 @@
 """Make small pictures of what Gaussians show from cameras, to compare them with photos.
 
 Colours are divided by opacity, so faint or sparse Gaussians have the colours of solid ones. The opacity of a pixel is
-its weight. Photos are averaged with the same weights, so pixels without Gaussians count in neither photos nor pictures.
+its weight. Photos are averaged with the same weights as pictures, so pixels without Gaussians count in neither.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class Pairs:
         return Pairs(average(self.photos, self.shown.weights, small.weights), small)
 
     def exchange(self) -> Pairs:
-        """Return pairs in which photos and pictures are exchanged."""
+        """Return a copy in which photos take the place of pictures, and pictures the place of photos."""
         return Pairs(self.shown.pictures, replace(self.shown, pictures=self.photos))
 
     def with_photos(self, photos: np.ndarray) -> Pairs:
@@ -101,9 +101,9 @@ def pair_photos(scene: Scene, photos: np.ndarray) -> Pairs:
 def show_views(scene: Scene, side: int | None = None, frame: Frame | None = None) -> ViewPictures:
     """Make small pictures of what a scene's Gaussians show in its views.
 
-    If each view has Gaussians of its own, a picture has the colours of a sample of them. Otherwise it is a render of a
-    sample of all Gaussians. ``side`` is the number of pixels on the longer side, by default :data:`PICTURE_PIXELS`.
-    ``frame`` is the canonical frame of the scene, if known.
+    If each view has Gaussians of its own, a view's picture has the colours of a sample of its Gaussians. If not, a
+    picture is a render of a sample of all Gaussians. ``side`` is the number of pixels on the longer side, by default
+    :data:`PICTURE_PIXELS`. ``frame`` is the canonical frame of the scene, if known.
     """
     if scene.has_own_pixels:
         return _show_rows(scene, PICTURE_PIXELS) if side is None else _show_rows(scene, 2 * side).shrink(side)
@@ -115,7 +115,7 @@ def show_views(scene: Scene, side: int | None = None, frame: Frame | None = None
 
 
 def _show_rows(scene: Scene, side: int) -> ViewPictures:
-    """Make pictures from the colours of the views' own Gaussians, one of every few pixels.
+    """Make pictures from the colours of the views' own Gaussians, with one of every few pixels.
 
     The longer side has at most ``side`` pixels.
     """

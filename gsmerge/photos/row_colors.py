@@ -1,9 +1,9 @@
 """Scene without photos -> the scene with the colours of its rows as photos; each view needs Gaussians of its own.
 
-Feed-forward models take the colour of a pixel's Gaussian from the photo. These colours are compared with a drawing of
-the view's own Gaussians from its own camera, after both are blurred. A solid drawing replaces the colours if they
-differ from it, and if the Gaussians of a pixel are so faint that their colours mean little. Pixels with neither a
-colour nor a solid drawing do not count.
+Feed-forward models take the colour of a pixel's Gaussian from the photo. The Gaussians' colours are compared with a
+drawing of the view's own Gaussians from its own camera, after both are blurred. A solid drawing replaces the colours if
+they differ from the drawing, and if the Gaussians of a pixel are so faint that their colours mean little. Pixels with
+neither a colour nor a solid drawing do not count.
 """
 
 from __future__ import annotations
@@ -25,16 +25,17 @@ from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import in_turn
 from gsmerge.types import PicturedScene, Scene
 
-# Names in messages of the pictures to which results are fitted and with which they are compared. If photos are missing,
-# these are the colours of the rows, or renders if the rows belong to no pixels
+# Names, in messages, of the pictures to which results are fitted and with which results are compared. If photos are
+# missing, the pictures are the colours of the rows, or renders if the rows belong to no pixels
 OWN_PHOTOS = "the scene's own photos"
 PHOTOS = "photos"
 ROW_COLORS = "the model's own pixels"
 RENDERS = "renders of the input"
 NO_PHOTOS = f"no photos: {ROW_COLORS} are used instead; name photos with --images"
 FAINT_OPACITY = 0.1  # opacity of a pixel's Gaussians below which their colours mean little
-# Standard deviation in pixels. After this blur, colours from photos differ from drawings by at most .18 in the exports
-# of nine captures. After a blur of only 2 pixels they differ by .39 where Gaussians of wrong depth hide others
+# Standard deviation in pixels. After this blur, colours from photos differ from drawings by at most .18 of [0, 1] in
+# the exports of nine captures. After a blur of only 2 pixels, colours and drawings differ by .39 where Gaussians of
+# wrong depth hide others
 ROW_BLUR_PIXELS = 8.0
 T = TypeVar("T")
 
@@ -42,14 +43,14 @@ T = TypeVar("T")
 def add_row_colors(scene: Scene, *, has_photos: bool = False) -> PicturedScene:
     """Use the colours of each view's own Gaussians as the photos of a canonical scene, with a note.
 
-    ``has_photos`` means that the scene has photos, but an earlier note has said that they do not count. Then this
-    function makes a note only if drawings are used.
+    ``has_photos`` means that the scene has photos, but an earlier note has said that they do not count. With
+    ``has_photos``, a note is made only if drawings are used.
     """
     shape = len(scene), scene.cameras.height, scene.cameras.width
     images, masks = np.zeros((*shape, 3), np.float32), np.full(shape, False)
 
     def store(views: np.ndarray, picture: RowPicture) -> int:
-        """Store the picture of a camera for its views; return in how many of their pixels it is a drawing."""
+        """Store the picture of a camera for its views; return at how many pixels of the views it is a drawing."""
         images[views], masks[views] = picture.picture, picture.known
         return len(views) * int(picture.by_drawing.sum())
 
@@ -74,8 +75,8 @@ class RowPicture:
 def picture_rows(scene: Scene, use: Callable[[np.ndarray, RowPicture], T], mask: np.ndarray | None = None) -> list[T]:
     """Draw the picture of every camera, and return the results of ``use(views, picture)``.
 
-    ``views`` are the views of the camera. There are several if its pixels have several layers of Gaussians. With ``mask
-    [v]``, only cameras with a view in the mask are drawn.
+    ``views`` are the views of the camera. A camera has several views if its pixels have several layers of Gaussians.
+    With ``mask [v]``, only cameras with a view in the mask are drawn.
     """
     kinds = camera_kinds(scene.cameras)
     groups = [np.flatnonzero(kinds == kind) for kind in range(kinds.max() + 1)]

@@ -74,7 +74,7 @@ class ScenePhotos:
 
     @property
     def file_size(self) -> Size | None:
-        """Most frequent size of the used part of upright photos, or the largest of several; None for no photos."""
+        """Most frequent size of the used part of upright photos; of several, the largest; None without photos."""
         sizes = [
             part_size(_upright_size(path, turn), self.part)
             for path, turn in zip(self.paths, self.turns, strict=True)
@@ -85,16 +85,16 @@ class ScenePhotos:
 
 @dataclass(frozen=True)
 class Proposal:
-    """Files that may be photos of c cameras, and the file that is proposed for each camera."""
+    """Files that may be photos of c cameras, of which one is proposed for each camera."""
 
     folder: Path
     pool: tuple[Path, ...]  # all files
     named: tuple[int | None, ...]  # for each camera, the index of its file in the pool; None without a proposed file
     exact: bool  # True: names propose the files; False: their order does
-    faults: tuple[str | None, ...] = ()  # for each camera, why its photo cannot be used; None if it can
+    faults: tuple[str | None, ...] = ()  # for each camera, why its photo cannot be used; None for no fault
     by_names: bool = False  # True: the folder was found by the names of its files
     fit: PartFit = WHOLE_FIT  # the part of each photo that is used
-    notes: tuple[str, ...] = ()  # on this part
+    notes: tuple[str, ...] = ()  # notes on the used part
 
     def tag(self, photo: int) -> int:
         """Return the orientation, 0 to 7, in the tag of a file of the pool."""
@@ -111,7 +111,7 @@ class Proposal:
         return [None if photo is None else Assignment(photo, 0) for photo in self.named]
 
     def without_views(self, cameras: Sequence[int]) -> Proposal:
-        """Return a copy in which ``cameras`` have a fault: they are unknown, since their views have no Gaussians."""
+        """Return a copy in which ``cameras`` have a fault: a camera is unknown if its view has no Gaussians."""
         faults = list(self.faults)
         for camera in cameras:
             path = self.paths[camera]
@@ -120,7 +120,7 @@ class Proposal:
         return replace(self, faults=tuple(faults))
 
     def without_files(self, faults: Mapping[Path, str]) -> Proposal:
-        """Return a copy without the files in ``faults``, whose values say why these files cannot be used.
+        """Return a copy without the files in ``faults``, which maps files to the reasons why they cannot be used.
 
         The reason becomes a fault of the cameras for which the file was proposed.
         """
@@ -134,7 +134,7 @@ class Proposal:
         return replace(self, pool=pool, named=tuple(named), faults=tuple(camera_faults))
 
     def without_unreadable(self, *, decode: bool) -> Proposal:
-        """Return a copy without the proposed files whose headers, or with ``decode`` whose pixels, cannot be read."""
+        """Return a copy without proposed files whose headers (with ``decode``, whose pixels) cannot be read."""
         paths = [path for path in dict.fromkeys(self.paths) if path is not None]
         faults = parallel_map(lambda path: _find_fault(path, decode=decode), paths)
         return self.without_files({path: fault for path, fault in zip(paths, faults, strict=True) if fault})
@@ -162,12 +162,12 @@ class ViewPhotos:
 
 
 def is_without_names(camera_file: CameraFile) -> bool:
-    """Return whether cameras were estimated and no photo has named them yet; photos may then have any size."""
+    """Return whether cameras were estimated and have no names of photos yet, so that photos may have any size."""
     return camera_file.source == ESTIMATED and camera_file.names[0] == UNNAMED
 
 
 def propose_photos(files: SceneFiles, camera_file: CameraFile) -> Proposal | None:
-    """Propose a photo file for every camera by names, or by order if no name fits and the numbers are equal.
+    """Propose a photo file for every camera by names, or if no name fits, by order if there is one file per camera.
 
     Files that cannot be read are left out. None if there are no files of photos.
     """
@@ -202,7 +202,7 @@ def propose_photos(files: SceneFiles, camera_file: CameraFile) -> Proposal | Non
 def _find_photos_near(files: SceneFiles, camera_file: CameraFile) -> tuple[Path, list[Path], list[Path | None]]:
     """Find photos near the camera file: the files that it names, or files beside the ``.ply``.
 
-    Returns their folder, all files, and for each camera the file of its name, or None.
+    Returns the folder of the photos, all files, and for each camera the file of its name, or None.
     """
     path, names = Path(camera_file.path), camera_file.names
     folder = capture_folder(path)
@@ -230,7 +230,7 @@ def _describe_missing_file(folder: Path, name: str) -> str:
 
 
 def _find_fault(path: Path, *, decode: bool = False) -> str | None:
-    """Return why the header of an image file, or with ``decode`` its pixels, cannot be read; None if they can."""
+    """Return why the header of an image file (with ``decode``, its pixels) cannot be read; None if it can be read."""
     try:
         size = image_size(path)
         if decode:
@@ -243,7 +243,8 @@ def _find_fault(path: Path, *, decode: bool = False) -> str | None:
 def stored_photos(files: SceneFiles, camera_file: CameraFile) -> PhotoArrays:
     """Read the photos of all cameras, from files of their names or from one file that has all photos.
 
-    Returns no photos if there are none. SceneError if a photo is missing or cannot be read, or if two differ in size.
+    Returns no photos if none exist. SceneError if a photo is missing or cannot be read, or if two photos differ in
+    size.
     """
     proposal = propose_photos(files, camera_file)
     if proposal is None:
@@ -260,7 +261,7 @@ def stored_photos(files: SceneFiles, camera_file: CameraFile) -> PhotoArrays:
 
 
 def photos_inside(files: SceneFiles, camera_file: CameraFile) -> PhotoArrays:
-    """Read the photos from the one file that has them all; return none if the scene has no such file."""
+    """Read the photos from the one file that has all photos; return no photos if the scene has no such file."""
     if files.images is None or files.images.is_dir():
         return ()
     same_file = files.cameras is not None and os.path.realpath(files.cameras) == os.path.realpath(files.images)
@@ -273,8 +274,8 @@ def photos_inside(files: SceneFiles, camera_file: CameraFile) -> PhotoArrays:
 def read_photos(proposal: Proposal, chosen: Sequence[Assignment | None], camera_file: CameraFile) -> ScenePhotos:
     """Read the chosen photo of each camera upright, and resize it to the size of most photos.
 
-    Photos of SHARP are resized to the size of their camera. SceneError if a photo cannot be read, or if its aspect
-    ratio differs from that of most photos.
+    Photos of a camera file of SHARP are resized to the size of their camera. SceneError if a photo cannot be read, or
+    if its aspect ratio differs from that of most photos.
     """
     paths = tuple(None if assignment is None else proposal.pool[assignment.photo] for assignment in chosen)
     turns = tuple(0 if assignment is None else assignment.orientation for assignment in chosen)
@@ -294,11 +295,11 @@ def read_photos(proposal: Proposal, chosen: Sequence[Assignment | None], camera_
 
 
 def select_one_shape(camera_file: CameraFile, proposal: Proposal) -> tuple[CameraFile, Proposal, list[str]] | None:
-    """Leave out photos that do not have the aspect ratio of most photos, and views whose cameras do not have it.
+    """Leave out photos that lack the aspect ratio of most photos, and views whose cameras lack it.
 
     A camera without a size has the aspect ratio of its photo. Returns the cameras and the photos of all other views,
-    and a doubt if views are left out. None if there are no photos, if all have one aspect ratio, or if fewer than two
-    views would remain.
+    and a doubt if views are left out. None if there are no photos, if all photos have one aspect ratio, or if fewer
+    than two views would remain.
     """
     paths = proposal.paths
     sizes = {path: image_size(path) for path in paths if path is not None}
@@ -324,13 +325,13 @@ def select_one_shape(camera_file: CameraFile, proposal: Proposal) -> tuple[Camer
 
 
 def _upright_size(path: Path, turn: int) -> Size:
-    """Read the size of a photo, and return the size after the turn."""
+    """Return the size of a photo after it is turned to the orientation ``turn``."""
     width, height = image_size(path)
     return (height, width) if turn % 2 else (width, height)
 
 
 def _list_candidates(proposal: Proposal, fit: GridFit | None) -> Candidates:
-    """Make candidates of the files of a proposal. Photos are read small, and fitted to a grid by ``fit`` if given."""
+    """Make candidates of the files of a proposal, read small, and fitted to a grid by ``fit`` if it is given."""
 
     def read(photo: int) -> np.ndarray:
         """Read a small version of a photo, and cut out the part that is used."""
@@ -353,7 +354,7 @@ def assign_to_views(scene: Scene, proposal: Proposal, camera_file: CameraFile, *
         scene: The scene.
         proposal: The files.
         camera_file: The cameras of the views.
-        read: True if the proposed files were read, and are the photos of the scene. Otherwise small versions are read.
+        read: True if the proposed files were read, and are the photos of the scene. If False, small versions are read.
     """
     fit = _fit_to_grid(scene, proposal) if is_without_names(camera_file) and proposal.pool else None
     guessed = list[int]()
@@ -387,7 +388,7 @@ def _fit_to_grid(scene: Scene, proposal: Proposal) -> GridFit:
 def has_other_shape(proposal: Proposal, camera_file: CameraFile) -> bool:
     """Return True if the first proposed photo, upright or turned, has another aspect ratio than all cameras.
 
-    Return False if that is expected, because the cameras' source is known to resize or crop photos.
+    Another aspect ratio is expected if the cameras' source is known to resize or crop photos; the result is False then.
     """
     photo, shapes = next((photo for photo in proposal.named if photo is not None), None), sizes_of(camera_file)
     if photo is None or not shapes or camera_file.photo_map is not None or camera_file.source in (FFGS, SHARP):
@@ -397,12 +398,12 @@ def has_other_shape(proposal: Proposal, camera_file: CameraFile) -> bool:
 
 
 def has_nearer_colors(scene: Scene, other: Scene) -> bool:
-    """Return whether the colours of a scene are nearer to its photos than those of ``other`` with the same photos."""
+    """Return whether a scene's colours are nearer to its photos than the colours of the scene ``other`` are."""
     images = scene.images
     assert images is not None
 
     def measure_errors(shown: ViewPictures) -> np.ndarray:
-        """Return the errors ``[n]`` of blocks between pictures and the scene's photos."""
+        """Return the differences ``[n]`` between blocks of pictures and the same blocks of the scene's photos."""
         return cut_blocks(Pairs(shrink_pictures(images, *shown.weights.shape[2:0:-1]), shown)).errors()
 
     return stands_out(
@@ -480,8 +481,9 @@ def _explain_absence(proposal: Proposal, view: int, name: str) -> str:
 def _describe_spare(proposal: Proposal, chosen: Sequence[Assignment | None], *, are_pixels: bool) -> list[str]:
     """Note the photos without a camera in the folders of the used photos, since they may show other parts of the scene.
 
-    If each Gaussian belongs to a pixel of a view (``are_pixels``), the cameras of the views see the whole scene. Then
-    photos without a camera are noted only if names propose photos, and if fewer photos are without a camera than used.
+    If each Gaussian belongs to a pixel of a view (``are_pixels``), the cameras of the views see the whole scene. With
+    ``are_pixels``, photos without a camera are noted only if names propose photos, and if more photos are used than are
+    without a camera.
     """
     used = [proposal.pool[assignment.photo] for assignment in chosen if assignment is not None]
     named = [proposal.pool[photo] for photo in proposal.named if photo is not None]
@@ -495,13 +497,13 @@ def _describe_spare(proposal: Proposal, chosen: Sequence[Assignment | None], *, 
 
 
 def describe_missing(names: Sequence[str], stored: CameraFile | SceneError | None, *, is_right: bool) -> str | None:
-    """Describe which views have no camera in the file ``stored``; None if this file may belong to another scene.
+    """Describe which views have no camera in the file ``stored``; None if ``stored`` may belong to another scene.
 
     Args:
         names: Names of the views. A view has the name of its photo, if a photo shows it.
-        stored: The cameras of the file, or why it cannot be read, or None.
-        is_right: True if the cameras of the file see the Gaussians. Otherwise the file counts only if every camera has
-            the name of a view.
+        stored: The cameras of the file, or why the file cannot be read; None if there is no file.
+        is_right: True if the cameras of the file see the Gaussians. If they do not, the file counts only if every
+            camera has the name of a view.
     """
     if not isinstance(stored, CameraFile):
         return None
@@ -516,7 +518,7 @@ def describe_missing(names: Sequence[str], stored: CameraFile | SceneError | Non
 
 
 def explain_mismatch(proposal: Proposal, camera_file: CameraFile) -> SceneError:
-    """Return the error that no photo shows any view; it names the photos that cannot be used."""
+    """Return the error that no photo shows any view, with the names of the photos that cannot be used."""
     views = f"the {len(camera_file)} views of {camera_file.widths[0]} x {camera_file.heights[0]} pixels"
     photos = "none that shows one of them"
     if has_other_shape(proposal, camera_file) and camera_file.source != ESTIMATED:
@@ -530,7 +532,7 @@ def explain_mismatch(proposal: Proposal, camera_file: CameraFile) -> SceneError:
 
 
 def without_photo(scene: Scene, views: Sequence[int]) -> Scene:
-    """Return a scene with pictures of its Gaussians in place of the photos of ``views``, whose pixels do not count."""
+    """Return a scene with pictures of its Gaussians in place of the photos of ``views``; their pixels do not count."""
     if scene.images is None:
         return scene
     images, ids = scene.images.copy(), list(views)

@@ -1,9 +1,9 @@
 """Score how similar photos and pictures of views are, in units of the noise of wrong pairs.
 
 A photo and a view are a wrong pair if the photo does not show the view. The similarity of a photo and a picture is the
-correlation of their local contrast at two sizes. Exposure, white balance and soft colours hardly change it.
-Correlations are converted to Fisher's z, whose noise does not depend on its value. Nearly all pairs of a scene are
-wrong, so the median absolute deviation of all z is the noise of wrong pairs.
+correlation of their local contrast at two sizes. Exposure, white balance and soft colours hardly change this
+correlation. Correlations are converted to Fisher's z, whose noise does not depend on its value. Nearly all pairs of a
+scene are wrong, so the median absolute deviation of all z is the noise of wrong pairs.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from gsmerge.raster.photos import LEAST_OPACITY, shrink_pictures
 
 SCORE_PIXELS = (24, 64)  # pixels of the longer side at which pictures are compared
 PICTURE_SPREADS = 6  # side of a picture, in standard deviations of the blur that gives the local mean
-CUT_OFF_SPREADS = 2  # standard deviations at which this blur is cut off
+CUT_OFF_SPREADS = 2  # standard deviations at which the blur of the local mean is cut off
 NOISE_MARGIN = 5.0  # standard deviations of the noise above which a value is evidence
 
 
@@ -48,7 +48,7 @@ def find_contrast(picture: np.ndarray, weight: np.ndarray | None = None, side: i
 
 @dataclass(frozen=True, eq=False)
 class _Filters:
-    """Contrast of v views at one size, in t orientations that a stored photo may have."""
+    """Contrast of the pictures of v views at one size, turned to t orientations that a stored photo may have."""
 
     size: tuple[int, int]  # width and height of the photos that are multiplied with the filters
     orientations: tuple[int, ...]  # the t orientations
@@ -110,7 +110,7 @@ class Comparer:
 def _make_filters(small: ViewPictures, quarters: Sequence[int]) -> _Filters:
     """Make filters for photos that are stored turned by any of the numbers ``quarters`` of quarter turns.
 
-    There is one filter for each view and number, and one more for the mirrored photo.
+    For each view and each number of turns there is a filter, and one more for the mirrored photo.
     """
     orientations = tuple(quarter + mirrored for mirrored in (0, ORIENTATIONS // 2) for quarter in quarters)
     products, weights, lengths = [], [], []
@@ -145,13 +145,13 @@ def measure_noise(z_scores: np.ndarray, least: float) -> tuple[np.ndarray, float
 
 
 def _median_of_known(scores: np.ndarray) -> float:
-    """Return the median of the ``scores [n]`` that are not NaN; 0 if all are, as for views without Gaussians."""
+    """Return the median of the ``scores [n]`` that are not NaN; 0 if all are NaN, as for views without Gaussians."""
     known = scores[~np.isnan(scores)]
     return median(known) if len(known) else 0.0
 
 
 def signed_ranks(gains: np.ndarray) -> float:
-    """Return the sum of the signed ranks of gains ``[n]`` in standard deviations (Wilcoxon 1945).
+    """Return the sum of the signed ranks of gains ``[n]``, divided by its standard deviation (Wilcoxon 1945).
 
     Ranks do not depend on the distribution of the gains, so a few large gains do not decide. Gains of 0 and NaN are
     left out. Returns 0 if no gain remains.
@@ -168,7 +168,7 @@ def signed_ranks(gains: np.ndarray) -> float:
 def stands_out(gains: np.ndarray) -> bool:
     """Return True if gains ``[n]`` are above zero by more than :data:`NOISE_MARGIN` standard deviations of their noise.
 
-    The gains must be held out: the change that causes them was fitted without the views, or the parts of views, in
-    which they are measured.
+    The gains must be held out: the change that causes a gain was fitted without the view, or the part of the view, in
+    which the gain is measured.
     """
     return signed_ranks(gains) > NOISE_MARGIN

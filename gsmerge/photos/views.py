@@ -19,7 +19,7 @@ BY_VIEW = ("cameras", "large_photos", "empty", *PER_PIXEL)  # fields of a scene 
 
 
 def even_views(num_views: int, count: int) -> list[int]:
-    """Return ``count`` view ids at equal intervals, with the first and the last; the middle one for ``count = 1``."""
+    """Return ``count`` view ids at equal intervals, with the first and the last; the middle id for ``count = 1``."""
     if not 1 <= count <= num_views:
         raise ValueError(f"views: expected 1 to {num_views}, got {count}")
     if count == 1:
@@ -28,9 +28,9 @@ def even_views(num_views: int, count: int) -> list[int]:
 
 
 def scored_views(num_views: int) -> list[int]:
-    """Return the ids of the views on which a whole scene is scored: all, or ``MAX_SCORED_VIEWS`` evenly spaced ones.
+    """Return the ids of the views on which a scene is scored: all views, or ``MAX_SCORED_VIEWS`` evenly spaced views.
 
-    The limit saves time, because the unmerged input is rendered in each of these views.
+    The limit saves time, because the unmerged input is rendered in each scored view.
     """
     return even_views(num_views, min(num_views, MAX_SCORED_VIEWS))
 
@@ -44,7 +44,8 @@ def pick_views(num_views: int, max_count: int) -> list[int]:
 def midpoint_views(contexts: Sequence[float], candidates: Sequence[float]) -> list[int]:
     """Return the index of the candidate nearest to the middle of each two consecutive ``contexts``.
 
-    Contexts and candidates are positions along the capture. Two contexts without a candidate between them are left out.
+    Contexts and candidates are positions along the capture. If no candidate lies between two contexts, these contexts
+    are left out.
     """
     midpoints = []
     for low, high in pairwise(sorted(contexts)):
@@ -55,7 +56,7 @@ def midpoint_views(contexts: Sequence[float], candidates: Sequence[float]) -> li
 
 
 def camera_kinds(cameras: Cameras) -> np.ndarray:
-    """Return a number ``[c]`` from 0 on for each camera; cameras with equal poses and intrinsics share a number."""
+    """Number cameras ``[c]`` from 0 on; cameras with equal poses and intrinsics share a number."""
     rows = np.concatenate([cameras.viewmats.reshape(-1, 16), cameras.Ks.reshape(-1, 9)], 1)
     numbers = [tuple(row) for row in rows.tolist()]
     kinds = {kind: i for i, kind in enumerate(sorted(set(numbers)))}
@@ -65,8 +66,8 @@ def camera_kinds(cameras: Cameras) -> np.ndarray:
 def subset(scene: SceneT, view_ids: Sequence[int]) -> SceneT:
     """Return the scene with only the views ``view_ids``.
 
-    If views have Gaussians of their own, only the Gaussians of these views stay. Otherwise all Gaussians stay, and
-    their pixels are unknown.
+    If views have Gaussians of their own, only the Gaussians of these views stay. If not, all Gaussians stay, and the
+    pixels of Gaussians are unknown.
     """
     ids = list(view_ids)
     fields = {name: array[ids] for name, array in vars(scene).items() if name in BY_VIEW and array is not None}
@@ -80,7 +81,7 @@ def subset(scene: SceneT, view_ids: Sequence[int]) -> SceneT:
 
 
 def take_rows(scene: SceneT, rows: np.ndarray) -> SceneT:
-    """Return the scene with only the Gaussians ``rows [m]``, ascending; the pixels of all others show no Gaussian."""
+    """Return the scene with only the Gaussians ``rows [m]``, ascending; pixels of other Gaussians show no Gaussian."""
     filled = None if scene.filled is None else scene.filled[rows]
     reduced = replace(scene, gaussians=scene.gaussians[rows], filled=filled, pixels=None)
     if not scene.has_own_pixels:

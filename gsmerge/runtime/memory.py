@@ -18,8 +18,9 @@ import numpy as np
 # Files with the memory limit of a control group, version 2 and version 1
 LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
 # Parameters of glibc with their values, see mallopt(3). An array of 32 MiB or more gets separate pages, which return to
-# the system when it is deleted. The process keeps up to 256 MiB of other freed memory for further arrays. With the
-# default values, each array gets new pages that the system has to clear, which takes a tenth of the time of `view`
+# the system when the array is deleted. Of the freed memory of smaller arrays, the process keeps up to 256 MiB for
+# further arrays. With glibc's default values, each array gets new pages that the system has to clear, which takes a
+# tenth of the time of `view`
 M_MMAP_THRESHOLD, M_TRIM_THRESHOLD = (-3, 1 << 25), (-1, 1 << 28)
 MAPPED_BYTES = 1 << 28  # arrays of this size or more are mapped from files
 # Bytes of memory that a run needs
@@ -27,8 +28,8 @@ BYTES_FIXED = 250_000_000  # for the interpreter and the libraries
 BYTES_PER_GAUSSIAN = 150  # for each Gaussian of the scene, without higher harmonics
 BYTES_PER_VALUE = 4.5  # for each value of higher harmonics, in the scene and in some of its groups
 BYTES_PER_PIXEL = 90  # for the photo as floats, and arrays of segmentation and rendering
-# Bytes that a conversion needs for each Gaussian, and for each value of higher harmonics. A .sog or .glb needs so many,
-# and a .ply needs a third
+# Bytes that a conversion to .sog or .glb needs for each Gaussian, and for each value of higher harmonics. A conversion
+# to .ply needs a third of these bytes
 BYTES_CONVERTED, BYTES_CONVERTED_VALUE = 330, 6
 BYTES_ELSEWHERE = 40  # for each Gaussian outside of the block that is in memory
 FEWER_PIXELS = (
@@ -49,7 +50,7 @@ def peak_memory() -> int:
 
 
 def machine_memory() -> int | None:
-    """Return the memory of this machine, or the limit of its control group if that is lower; bytes, None if unknown."""
+    """Return the bytes of memory of this machine, or the limit of its control group if lower; None if unknown."""
     if sys.platform == "win32":
         return _memory_status()[1]
     limits = []
@@ -72,7 +73,7 @@ def free_memory() -> int | None:
 
 
 def _memory_status() -> list[int]:
-    """Return the struct MEMORYSTATUSEX of Windows as numbers; the second is all memory, the third is free memory."""
+    """Return the struct MEMORYSTATUSEX of Windows as numbers; the second is all memory, the third free memory."""
     status = (ctypes.c_uint64 * 8)(64)  # the structure begins with its size
     if sys.platform == "win32":
         ctypes.windll.kernel32.GlobalMemoryStatusEx(status)
@@ -90,12 +91,12 @@ def memory_bytes(pixels: int, *, num_rest: int = 0, num_elsewhere: int = 0) -> i
 
 
 def conversion_bytes(count: int, num_rest: int) -> int:
-    """Estimate the memory of a conversion in bytes; ``num_rest`` is the number of values of higher harmonics."""
+    """Estimate the memory, bytes, that a conversion of ``count`` Gaussians with ``num_rest`` higher harmonics needs."""
     return count * (BYTES_CONVERTED + BYTES_CONVERTED_VALUE * num_rest)
 
 
 def memory_problem(needed: int, remedy: str = FEWER_PIXELS) -> str | None:
-    """Return the message for a run that needs more memory than this machine has, with a remedy; None if it fits."""
+    """Return the message, with a remedy, for a run that needs more memory than this machine has; None if it fits."""
     available = machine_memory()
     if available is None or needed <= available:
         return None
@@ -105,7 +106,7 @@ def memory_problem(needed: int, remedy: str = FEWER_PIXELS) -> str | None:
 def keep_memory() -> None:
     """Let new arrays reuse the memory of deleted arrays, if the C library can.
 
-    Processes that do a single job call it, because the process then keeps more memory than it uses.
+    Only processes that do a single job call this function, after which a process keeps more memory than it uses.
     """
     with suppress(AttributeError, OSError, TypeError):  # not glibc
         mallopt = ctypes.CDLL(None).mallopt
@@ -116,8 +117,8 @@ def keep_memory() -> None:
 def release_memory() -> None:
     """Return freed memory to the operating system.
 
-    The C library glibc keeps memory that a thread has freed for this thread. If stages use different threads, the kept
-    memory is up to a tenth of the peak. The function does nothing on systems other than Linux.
+    The C library glibc keeps memory that a thread has freed for this thread. If the stages of a run use different
+    threads, the kept memory is up to a tenth of the peak memory. The function does nothing on systems other than Linux.
     """
     if sys.platform == "linux":
         with suppress(OSError, AttributeError):
@@ -128,8 +129,8 @@ def make_array(shape: tuple[int, ...], dtype: type[np.generic], mapped_bytes: in
     """Return an uninitialised array. A large array is mapped from an unnamed temporary file, if the disk has room.
 
     A large array has at least ``mapped_bytes`` bytes, or ``MAPPED_BYTES`` if that is less or ``mapped_bytes`` is None.
-    A mapped array takes memory only for the pages in use, and none after :func:`free_pages`. Its file is in the
-    system's temporary folder (``TMPDIR``) and is removed with the array.
+    A mapped array takes memory only for the pages in use, and none after :func:`free_pages`. The file of a mapped array
+    is in the system's temporary folder (``TMPDIR``) and is removed with the array.
     """
     size = math.prod(shape) * np.dtype(dtype).itemsize
     if size >= min(MAPPED_BYTES, mapped_bytes or MAPPED_BYTES) and hasattr(os, "posix_fallocate"):
@@ -167,7 +168,7 @@ def gather(array: np.ndarray, *ids: np.ndarray) -> np.ndarray:
 def human_share(share: float, digits: int = 2) -> str:
     """Format a share in [0, 1] as a percentage: ``0.044`` -> ``4.40 %``.
 
-    The percentage has ``digits`` decimals, or more if these would all be zeros.
+    The percentage has ``digits`` decimals, or more decimals if these would all be zeros.
     """
     percent = 100 * share
     digits = digits if percent <= 0 else max(digits, -math.floor(math.log10(percent)))

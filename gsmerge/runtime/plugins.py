@@ -39,7 +39,7 @@ def lazy_functions(package: str) -> Callable[[str], LazyFunction]:
 
 @cache
 def find_plugins(group: str) -> dict[str, EntryPoint]:
-    """Return the entry points of a group, sorted by name, without importing them. Of equal names the first is used."""
+    """Return a group's entry points, sorted by name and not imported; of several with one name, the first."""
     from importlib.metadata import entry_points  # takes 8 ms, and most commands do not need it
 
     plugins: dict[str, EntryPoint] = {}
@@ -49,7 +49,7 @@ def find_plugins(group: str) -> dict[str, EntryPoint]:
 
 
 def load_plugin(group: str, name: str) -> Any:
-    """Import and return the object of an entry point. If that fails, raise UsageError with the name of its package."""
+    """Import and return the object of an entry point; if the import fails, raise UsageError with the package's name."""
     entry = find_plugins(group)[name]
     try:
         return entry.load()

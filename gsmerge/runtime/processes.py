@@ -22,7 +22,8 @@ LOST, FEWER = "its process was killed or ended unexpectedly", "perhaps out of me
 class ProcessPool(WorkerPool):
     """A pool of up to ``jobs`` processes. Each has an executor of its own, so a process that dies loses only its call.
 
-    The calls that run at the same time may need ``memory`` bytes together. A call that needs more runs alone.
+    The calls that run at the same time may together need ``memory`` bytes. A call that needs more than ``memory`` runs
+    alone.
     """
 
     def __init__(self, jobs: int, threads: int, memory: float) -> None:
@@ -31,7 +32,7 @@ class ProcessPool(WorkerPool):
         self.calls: dict[Future[Any], tuple[Call, ProcessPoolExecutor]] = {}  # running calls, each with its executor
 
     def has_room(self, call: Call) -> bool:
-        """Return true if a call fits into the memory beside the calls that run, or if none runs."""
+        """Return true if a call fits into the memory beside the calls that run, or if no call runs."""
         needed = call.memory + sum(running.memory for running, _ in self.calls.values())
         return not self.calls or needed <= self.memory
 

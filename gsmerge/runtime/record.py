@@ -1,8 +1,8 @@
 """Record what a run does: the seconds of each stage, choices, notes for the user, and progress.
 
 A run begins a record with :func:`record_run`. Code within the run, on the same thread, writes to this record with
-:func:`stage`, :func:`note` and :func:`record_choices`, so the record is no argument of any function. Outside a run
-these functions write nothing.
+:func:`stage`, :func:`note` and :func:`record_choices`, so the record is no argument of any function. Outside a run,
+calls of :func:`stage`, :func:`note` and :func:`record_choices` write nothing.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ STAGES = (
     "partition", "prepare", "segment", "curve", "reduce", "members", "encode", "match", "refine",
     "cover", "decode", "join", "fit", "prune", "fill", "score", "input",
 )  # fmt: skip
-FIT_STEP = "fit: "  # the texts that report steps of a fit begin with this
+FIT_STEP = "fit: "  # texts that report steps of a fit begin with this text
 BEFORE_FIT = 0.8  # share of the seconds of stages without fits that pass before the fits
-# Memory is released after these stages. Their threads have freed much of it, but other threads cannot use it
+# Memory is released after these stages, whose threads have freed much memory that other threads cannot use
 RELEASED = ("prepare", "segment", "encode", "match", "refine", "fit")
 
 
 class RunPart(NamedTuple):
-    """Expected seconds of a part of a run. Only the ratios of these seconds matter."""
+    """Expected seconds of a part of a run; only the ratios between the seconds of all parts matter."""
 
     stages: float  # seconds in stages without fits
     fits: float = 0.0  # seconds in fits
@@ -65,7 +65,7 @@ class Forecast:
         self.parts[self.has_begun :] = parts
 
     def take_step(self, step: int, num_steps: int) -> None:
-        """Update the estimate when a fit has reached a step of ``num_steps``."""
+        """Update the estimate of the finished share when a fit has reached step ``step`` of ``num_steps``."""
         self.fit += step < self.step  # a lower step than before belongs to the next fit
         self.step = step
         if self.has_begun:
@@ -88,7 +88,7 @@ class Record:
     choices: dict[str, Any] = field(default_factory=dict)  # Decisions of the stages, by name
     notes: list[str] = field(default_factory=list)  # Warnings and adaptations, each once
     running: str | None = None  # The stage that is being timed
-    forecast: Forecast = field(default_factory=Forecast)  # Of the whole run; the records of its parts share it
+    forecast: Forecast = field(default_factory=Forecast)  # Shared by the records of a run and its parts
 
 
 _current: ContextVar[Record | None] = ContextVar("record", default=None)
@@ -111,8 +111,8 @@ def current_record() -> Record:
 def record_part(*, silent: bool = False, title: str | None = None) -> Iterator[Record]:
     """Start a separate record for a part of the current run, to which all code in the block writes.
 
-    If ``silent`` is true, the progress of the part is not reported. A ``title`` is put before the names of the part's
-    stages in reports of progress, as if they were steps of one stage.
+    If ``silent`` is true, the progress of the part is not reported. In reports of progress, ``title`` is put before the
+    names of the part's stages, as if these stages were steps of one stage.
     """
     progress = None if silent else current_record().progress
     if progress is not None and title is not None:
@@ -140,8 +140,8 @@ def _write_to(record: Record) -> Iterator[Record]:
 def stage(name: str) -> Iterator[None]:
     """Report the progress of a stage, and record the seconds of the block, or of the decorated function.
 
-    Within another stage this does nothing, because the time counts for the outer stage. If ``name`` is not one of
-    ``STAGES``, the number of finished stages is reported in place of its index.
+    A stage within another stage is neither reported nor recorded, because its time counts for the outer stage. If
+    ``name`` is not one of ``STAGES``, the number of finished stages is reported in place of an index in ``STAGES``.
     """
     record = _current.get()
     if record is None or record.running is not None:
@@ -160,14 +160,14 @@ def stage(name: str) -> Iterator[None]:
 
 
 def list_some(items: Sequence[str], separator: str = ", ") -> str:
-    """Return the first items as a text for a note, and the number of items that are left out."""
+    """Join the first items to a text for a note, with the number of items that are left out."""
     max_named = 4  # largest number of items that a note lists
     rest = f" and {len(items) - max_named} more" if len(items) > max_named else ""
     return separator.join(items[:max_named]) + rest
 
 
 def note(text: str) -> None:
-    """Add a note or a :class:`Doubt` to the current record and to the package's log, unless the record has it."""
+    """Add a note or a :class:`Doubt` to the current record and to the package's log, unless it is in the record."""
     record = current_record()
     if text not in record.notes:
         record.notes.append(text)
@@ -206,7 +206,7 @@ def begin_part() -> None:
 def report_progress(text: str, done: int, total: int) -> None:
     """Report to the caller of the current run that ``done`` of ``total`` steps are done.
 
-    ``text`` is the name of a stage. For a step within a stage, it is ``"stage: detail"``.
+    ``text`` is the name of a stage. For a step within a stage, ``text`` is ``"stage: detail"``.
     """
     record = current_record()
     if text.startswith(FIT_STEP):

@@ -1,10 +1,10 @@
 """Compute many items in parallel, on one pool of threads for the whole package.
 
-A kernel runs on one thread and releases the GIL, so several threads can run kernels at once, each on another view or on
-another band of an image. Threads wait for each other only at the end of a pass over all views, and they sleep while
-they wait. A result cannot depend on the number of threads, because every item is computed by itself and results are
-returned in order. While a pool is in use, OpenCV and torch may use one thread each, so that they do not compete with
-the pool for cores. Torch is limited only if other code has imported it.
+A kernel runs on one thread and releases the GIL of Python, so several threads can run kernels at once, each on another
+view or on another band of an image. Threads wait for each other only at the end of a pass over all views, and sleep
+while they wait. A result cannot depend on the number of threads, because every item is computed by itself and results
+are returned in order. While a pool is in use, OpenCV and torch may use one thread each, so that they do not compete
+with the pool for cores. Torch is limited only if other code has imported it.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class _Pool:
         work_alone()
         while (work := self.work.get()) is not None:
             work()
-            del work  # otherwise its arrays would stay in memory until the next work comes
+            del work  # otherwise the arrays of ``work`` would stay in memory until the next work comes
 
     def shutdown(self) -> None:
         """End the threads after all submitted work is done."""
@@ -59,7 +59,8 @@ def quiet_warnings() -> Iterator[None]:
     """Ignore warnings of libraries in the block, which may run in several threads at once.
 
     Filters of warnings are shared by all threads. If each block used Python's ``catch_warnings``, a block could restore
-    the filters that another one has set. So the first block sets the filter, and the last one to end removes it.
+    filters that another block has set. To prevent this, the first block sets the filter, and the last block that ends
+    removes it.
     """
     with _Quiet.lock:
         if not _Quiet.blocks:
@@ -89,12 +90,12 @@ class _Local(threading.local):
 
     pool: _Pool | None = None
     count = 1  # threads that parallel_map uses
-    inside = False  # True on a thread that computes an item, which must not wait for a pool
-    holds_torch = False  # True if torch was limited to one thread for this thread's pool
+    inside = False  # True on a thread that computes an item; such a thread must not wait for a pool
+    holds_torch = False  # True if torch was limited to one thread because this thread has a pool
 
 
 class _Libraries:
-    """Numbers of threads of torch and OpenCV. These are settings of the process, so all callers share them."""
+    """Numbers of threads of torch and OpenCV, which are settings of the process, so all callers share them."""
 
     lock = threading.Lock()
     pools = 0  # number of pools in use
@@ -119,7 +120,7 @@ def available_threads() -> int:
 
 
 def work_alone() -> None:
-    """Let the calling thread compute the items of :func:`parallel_map` one by one, as threads of a pool do."""
+    """Let the calling thread compute all items of :func:`parallel_map` by itself, as threads of a pool do."""
     _local.inside = True
 
 
@@ -158,8 +159,8 @@ def _hold_opencv() -> None:
 def hold_torch() -> None:
     """Limit torch to one thread while the calling thread has a pool, if torch is imported.
 
-    :func:`use_threads` and :func:`parallel_map` call it. Code that imports torch while a pool is in use must call it
-    before its first computation.
+    :func:`use_threads` and :func:`parallel_map` call this function. Code that imports torch while a pool is in use must
+    call :func:`hold_torch` before its first computation with torch.
     """
     torch = sys.modules.get("torch")
     if _local.pool is None or _local.holds_torch or torch is None or not hasattr(torch, "set_num_threads"):
@@ -172,7 +173,7 @@ def hold_torch() -> None:
 
 
 def _release_libraries() -> None:
-    """Count one pool less. Restore torch's threads if this pool has limited them, and OpenCV's after the last pool."""
+    """Count one pool less; restore torch's threads if this pool limited torch, and OpenCV's after the last pool."""
     with _libraries.lock:
         _libraries.pools -= 1
         if _local.holds_torch:
@@ -186,8 +187,8 @@ def _release_libraries() -> None:
 def parallel_map(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
     """Return ``[function(item) for item in items]``, computed on the pool, in the order of the items.
 
-    Outside of :func:`use_threads`, a pool with all processors is made for the call. If ``function`` calls it again, the
-    inner call computes its items one by one. The calling thread computes items as well.
+    Outside of :func:`use_threads`, a pool with all processors is made for the call. If ``function`` itself calls
+    :func:`parallel_map`, the inner call computes its items one by one. The calling thread computes items as well.
     """
     items = list(items)
     with use_threads() as count:
@@ -199,7 +200,7 @@ def parallel_map(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
 def in_turn(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
     """Yield the results of :func:`parallel_map` in order, with at most ``AT_ONCE`` of them in memory at a time.
 
-    Callers use it for large results of views, so that memory does not grow with the number of views.
+    Callers use :func:`in_turn` for large results of views, so that memory does not grow with the number of views.
     """
     items = list(items)
     for start in range(0, len(items), AT_ONCE):
@@ -209,8 +210,8 @@ def in_turn(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
 def _compute_on_pool(pool: _Pool, function: Callable[[T], R], items: list[T], num_helpers: int) -> list[R]:
     """Compute the items on this thread and on ``num_helpers`` threads of the pool; a free thread takes the next item.
 
-    Threads that took no item are not waited for. After an error, a thread takes further items without computing them.
-    If several items fail, the error of the first failed item is raised, even if another thread failed earlier.
+    The call does not wait for threads that took no item. After an error, a thread takes further items without computing
+    them. If several items fail, the error of the first failed item is raised, even if another thread failed earlier.
     """
     results: list[R] = [None] * len(items)  # type: ignore[list-item]
     indices = itertools.count()  # its next() is atomic
@@ -218,7 +219,7 @@ def _compute_on_pool(pool: _Pool, function: Callable[[T], R], items: list[T], nu
     counts: SimpleQueue[int] = SimpleQueue()  # number of items that each thread took
 
     def work() -> None:
-        """Take items and compute them until none is left, and then report how many were taken."""
+        """Take items and compute them until no item is left, and then report how many items were taken."""
         num_taken, has_failed = 0, False
         for index in indices:
             if index >= len(items):

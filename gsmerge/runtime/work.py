@@ -1,8 +1,8 @@
 """Make calls in this process, in other processes of this machine, or on a Ray cluster.
 
-Ray is an optional dependency, which schedules calls by their threads and memory. If a process dies, its call is lost.
-On a cluster, another process repeats the call, with the same result. The pool of processes of this machine is in
-:mod:`gsmerge.runtime.processes`.
+Ray is an optional dependency, which schedules calls by their threads and memory. If a process on this machine dies, the
+call that it was making is lost. On a cluster, another process repeats the call, with the same result. The pool of
+processes of this machine is in :mod:`gsmerge.runtime.processes`.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ SMALL_STORE = 100 << 20  # bytes for shared objects, if Ray starts a cluster on 
 class Call(NamedTuple):
     """A call to make in another process."""
 
-    key: Any  # by which the caller recognises the result
+    key: Any  # key by which the caller recognises the result
     arguments: tuple[Any, ...]
     memory: int = 0  # bytes that the call may need
 
@@ -48,8 +48,8 @@ class WorkerPool(ABC):
     def run(self, function: Callable[..., Any], calls: Iterable[Call]) -> Iterator[tuple[Any, Any]]:
         """Make calls of a picklable function; take the next call when a process is free.
 
-        Yields the key and the result of each call as soon as it ends. If the process died, the result is a
-        :class:`LostProcess`. Raises the exception of a failed call.
+        Yields the key and the result of each call as soon as the call ends. The result of a call whose process died is
+        a :class:`LostProcess`. Raises the exception of a failed call.
         """
         waiting, num_running, call = iter(calls), 0, None  # `call` is the next call, if it still waits for memory
         while True:
@@ -63,7 +63,7 @@ class WorkerPool(ABC):
             yield from ended
 
     def has_room(self, call: Call) -> bool:
-        """Return true if a call may start beside the calls that run. If none runs, the answer must be true."""
+        """Return true if a call may start beside the calls that run; if no call runs, the answer has to be true."""
         return True
 
     @abstractmethod
@@ -83,7 +83,7 @@ class WorkerPool(ABC):
 def start_work(engine: str, address: str | None = None, *, threads: int | None, memory: int) -> Iterator[Work]:
     """Open an engine for calls that each need ``memory`` bytes and ``threads`` threads (None: the engine chooses).
 
-    The ``engine`` "local" makes calls in this process, one after the other. The engine "ray" makes them on the Ray
+    The ``engine`` "local" makes calls in this process, one after the other. The engine "ray" makes calls on the Ray
     cluster at ``address``.
     """
     with ExitStack() as stack:
@@ -106,8 +106,8 @@ class Cluster:
     def needs(self, threads: int, memory: int) -> dict[str, float]:
         """Return the resources that a task with ``threads`` and ``memory`` bytes requests from Ray.
 
-        They are limited to the resources of the largest node, because a task that requests more would wait forever.
-        Raises UsageError if no node has processors.
+        The requests are limited to the resources of the largest node, because a task that requests more would wait
+        forever. Raises UsageError if no node has processors.
         """
         nodes = [node["Resources"] for node in self.ray.nodes() if node["Alive"] and node["Resources"].get("CPU")]
         if not nodes:
@@ -137,13 +137,14 @@ class Work:
     ) -> Iterator[tuple[T, Record]]:
         """Make ``count`` calls of a picklable function; yield the result and the record of each call, in order.
 
-        A cluster makes as many calls at once as its processors allow. This process makes one call after the other.
+        Reports of progress show ``title``. A cluster makes as many calls at once as its processors allow. This process
+        makes one call after the other.
         """
         if self.cluster is not None:
             yield from self._run_on_cluster(self.cluster, title, function, count, calls)
             return
         number = 0
-        for arguments in calls:  # enumerate would keep the arguments in memory until the next arguments are made
+        for arguments in calls:  # enumerate would keep these arguments in memory until the next arguments are made
             number += 1  # noqa: SIM113
             with record_part(title=f"block {number} of {count}: {title}") as record:
                 result = function(*arguments)
@@ -178,12 +179,12 @@ def _call_in_part(threads: int, function: Callable[..., T], *arguments: Any) -> 
 
 
 class RayPool(WorkerPool):
-    """A pool that makes up to ``jobs`` calls at once on a Ray cluster. If ``jobs`` is 0, all processors are used."""
+    """A pool that makes up to ``jobs`` calls at once on a Ray cluster; if ``jobs`` is 0, on all processors."""
 
     def __init__(self, cluster: Cluster, threads: int, *, jobs: int = 0) -> None:
         self.cluster, self.ray = cluster, cluster.ray
         self.threads, self.jobs = threads, jobs
-        calls_per_process = 200  # after these a process is replaced, so that memory leaks of libraries cannot add up
+        calls_per_process = 200  # then a process is replaced, so that memory leaks of libraries cannot add up
         self.function = self.ray.remote(max_retries=RETRIES, max_calls=calls_per_process)(_call_in_folder)
         self.keys: dict[Any, Any] = {}  # key of each running call, by the reference to its result
 
@@ -205,7 +206,7 @@ class RayPool(WorkerPool):
         return [(self.keys.pop(ref), self._result(ref)) for ref in ready]
 
     def _result(self, ref: Any) -> Any:
-        """Return the result of a call, or a LostProcess if it was lost; raise the exception of a failed call."""
+        """Return a call's result, or a LostProcess if its process was lost; raise the exception of a failed call."""
         try:
             return self.ray.get(ref)
         except self.ray.exceptions.RayTaskError as error:
@@ -229,7 +230,7 @@ def _call_in_folder(folder: str, function: Callable[..., T], *arguments: Any) ->
 
 
 def require_ray() -> ModuleType:
-    """Import Ray. Raises UsageError if it is not installed."""
+    """Import Ray; raise UsageError if Ray is not installed."""
     try:
         import ray
     except ImportError as error:
@@ -238,9 +239,9 @@ def require_ray() -> ModuleType:
 
 
 def _connect(ray: ModuleType, address: str | None, store_bytes: int | None) -> None:
-    """Connect to the Ray cluster at ``address``. If it is None, start a cluster on this machine.
+    """Connect to the Ray cluster at ``address``, or if ``address`` is None, start a cluster on this machine.
 
-    ``store_bytes`` is then the memory for shared objects.
+    ``store_bytes`` is the memory for shared objects of a cluster that is started.
     """
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # Ray would hide GPUs from calls
     os.environ.setdefault("RAY_task_oom_retries", str(RETRIES))  # of tasks that Ray ends when memory runs out

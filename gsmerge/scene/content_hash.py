@@ -43,7 +43,7 @@ def content_hash(files: Sequence[Path]) -> str:
 
 
 def _walk(root: Path) -> list[Path]:
-    """List all files in a folder, sorted; for a file, list only the file itself."""
+    """List all files in a folder, sorted; for a path of a file, list only this file."""
     return sorted(path for path in walk_files(root) if path.is_file()) if root.is_dir() else [root]
 
 
@@ -59,7 +59,7 @@ def list_changed(stats: Mapping[Path, tuple[int, ...]]) -> list[str]:
 
 
 def doubt_changed(stats: Mapping[Path, tuple[int, ...]]) -> list[str]:
-    """Return a list with a doubt about a result, if files of its scene have changed since they were read."""
+    """Return a list with a doubt about a result if files of the result's scene have changed since they were read."""
     changed = list_changed(stats)
     more = f" and {count_words(len(changed) - 1, 'other file')}" if len(changed) > 1 else ""
     problem = "changed during the run; the result is of what was read before"
@@ -75,7 +75,7 @@ def _read_stat(path: Path) -> tuple[int, ...] | None:
 
 
 def list_files(files: SceneFiles) -> list[Path]:
-    """List all files and folders that a scene is read from, each once."""
+    """List every file and folder that a scene is read from, each once."""
     paths = list(files.paths)
     for cameras in filter(None, (files.cameras, *files.others)):
         root = cameras if cameras.is_dir() else cameras.parent

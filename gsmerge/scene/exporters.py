@@ -38,10 +38,10 @@ class Model:
 
     title: str  # the name that people use
     source: str  # repository and commit that were read; single files may have a later commit
-    output: str  # what files it writes, beyond what the exporter says
+    output: str  # what files the model writes, beyond what its exporter says
     result: str = "read right"  # how gsmerge reads these files, and what the user has to add
     place: str = ""  # pattern of its files' paths, if no other model with the same columns uses these paths
-    camera_advice: str = ""  # a clause that says how to get its cameras if they are missing
+    camera_advice: str = ""  # a clause that says how to get cameras of its scenes if they are missing
 
 
 @dataclass(frozen=True)
@@ -50,13 +50,13 @@ class Exporter:
 
     name: str  # on the command line
     models: tuple[Model, ...]  # the models that use it
-    opacity: Literal["logit", "raw"]  # how it stores opacities
+    opacity: Literal["logit", "raw"]  # how the exporter stores opacities
     order: Order  # order of its rows; "none": rows have no pixels, or are in another order
-    degrees: tuple[int, ...] = (0,)  # SH degrees that it writes
-    normals: bool = True  # whether it writes the columns nx, ny, nz
-    elements: tuple[str, ...] = ()  # elements besides ``vertex`` that it always writes
-    byte_columns: tuple[str, ...] = ()  # columns that it writes as bytes
-    comment: str = ""  # part of a comment in the header that it always writes
+    degrees: tuple[int, ...] = (0,)  # SH degrees that the exporter writes
+    normals: bool = True  # whether the exporter writes the columns nx, ny, nz
+    elements: tuple[str, ...] = ()  # elements besides ``vertex`` that the exporter always writes
+    byte_columns: tuple[str, ...] = ()  # columns that the exporter writes as bytes
+    comment: str = ""  # part of a comment in the header that the exporter always writes
     cameras: tuple[str, ...] = ()  # formats of cameras that it writes; empty: it writes none, and any may be given
 
     def writes_columns(self, info: FileInfo) -> bool:
@@ -72,7 +72,7 @@ class Exporter:
 
     @property
     def is_marked(self) -> bool:
-        """Return whether its files have an element, column or comment that no other exporter writes."""
+        """Return whether the exporter's files have an element, column or comment that no other exporter writes."""
         return bool(self.elements or self.byte_columns or self.comment)
 
 
@@ -106,8 +106,8 @@ _EXPORTERS = (
         "logit", "view-major",
         cameras=("DA3 npz", "COLMAP binary", "COLMAP text", ESTIMATED),
     ),
-    # The family of pixelSplat shares code but differs in order, trimming and rotations. Its worlds are recentred on
-    # the median, divided by a quantile and rotated upright. No file stores this scale and this shift.
+    # Models of the pixelSplat family share code but differ in order, trimming and rotations. Each centres the world on
+    # its median, divides it by a quantile and rotates it upright. No file stores this scale and this shift.
     Exporter(
         "pixelsplat",
         (Model("pixelSplat", "dcharatan/pixelsplat 32b1b66", "`gaussians/RUN/STEP.ply`; no cameras", _NAME_CAMERAS),),
@@ -299,7 +299,8 @@ _EXPORTERS = (
         ),
         "logit", "view-major", normals=False,
     ),
-    # Long-LRM writes normals as bytes, and 45 harmonics for every degree. If it prunes, it sorts rows by opacity.
+    # Long-LRM writes normals as bytes, and 45 harmonics for every degree. When Long-LRM prunes, it sorts rows by
+    # opacity.
     Exporter(
         "longlrm",
         (
@@ -390,9 +391,9 @@ def find_exporter(name: str) -> Exporter | None:
 def choose_exporters(name: str, info: FileInfo, order: str, cameras: str) -> tuple[Exporter, ...]:
     """Return the exporter with a name; for "auto", all exporters that may have written the file.
 
-    They write the columns of the file, the format of its ``cameras`` ("" without cameras), and its ``order`` of rows
-    ("none" if rows have no pixels). If exporters leave a mark in the file, only these are returned, with any order of
-    rows if none has this order.
+    An exporter may have written the file if it writes the file's columns, the format of its ``cameras`` ("" without
+    cameras), and its ``order`` of rows ("none" if rows have no pixels). If the file has a mark of exporters, only
+    exporters with this mark are returned, even if none of them writes rows in the order ``order``.
     """
     exporter = find_exporter(name)
     if exporter is not None:
@@ -406,8 +407,8 @@ def choose_exporters(name: str, info: FileInfo, order: str, cameras: str) -> tup
 def find_cameras_of_model(info: FileInfo) -> str:
     """Describe how to get the cameras of a file from the model that wrote it; empty if the model is unknown.
 
-    A model is recognised by the path of the file, or by a mark of its exporter. Empty also if recognised models give
-    different advice.
+    A model is recognised by the path of the file, or by a mark of its exporter. The text is also empty if recognised
+    models give different advice.
     """
     path = Path(info.path).absolute()
     models = [

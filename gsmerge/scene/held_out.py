@@ -21,7 +21,7 @@ from gsmerge.scene.read import Loaded
 from gsmerge.scene.views import limit_photo_size
 from gsmerge.types import Scene, StrPath, Views
 
-_OPTION = "evaluate --target-images"  # gsmerge view has no such option
+_OPTION = "evaluate --target-images"  # `gsmerge view` does not have this option
 
 
 @dataclass(frozen=True)
@@ -29,18 +29,18 @@ class HeldOutViews(Views):
     """Held-out views, from which the scene was not made, in the frame of its Gaussians."""
 
     places: tuple[int, ...]  # index of each held-out view in the camera file, which is its place along the trajectory
-    context_places: tuple[int, ...] | None  # index in this file of each view of the scene; None if it lacks one
-    notes: tuple[str, ...] = ()  # what was adapted, one sentence each
+    context_places: tuple[int, ...] | None  # index in this file of each view of the scene; None if it lacks a view
+    notes: tuple[str, ...] = ()  # notes on what was adapted, one sentence each
 
 
 def read_held_out(load: Loaded, cameras: StrPath, images: StrPath | None = None) -> HeldOutViews:
     """Read held-out photos and their cameras, in any format that a scene may have.
 
-    Views from which the scene was made are left out. If the file has these views under the same names, their poses show
-    how the file's world maps to the world of the Gaussians. Otherwise the file is assumed to share the world of the
-    scene's own cameras. Poses are read in the convention in which the scene's cameras fit. ``images`` is the folder of
-    the photos. If it is None, the camera file names them. Raises SceneError if a file is missing or damaged, or if no
-    view remains.
+    Views from which the scene was made are left out. If the file has views of the scene under the same names, their
+    poses show how the file's world maps to the world of the Gaussians. If names do not show how both worlds map, the
+    file is assumed to share the world of the scene's own cameras. Poses are read in the convention in which the scene's
+    cameras fit. ``images`` is the folder of the photos; if ``images`` is None, the camera file names the photos. Raises
+    SceneError if a file is missing or damaged, or if no view remains.
     """
     path = Path(cameras)
     if not path.exists():
@@ -77,8 +77,8 @@ def read_held_out(load: Loaded, cameras: StrPath, images: StrPath | None = None)
 def read_into_frame(load: Loaded, path: Path) -> tuple[CameraFile, dict[int, int]]:
     """Read a camera file, and move its cameras into the frame of a scene's Gaussians; also find the shared views.
 
-    Shared views are views of the file that the scene also has. They are returned as a map from their indices in the
-    file to their indices in the scene. Frame and convention are found as in :func:`read_held_out`.
+    Shared views are views of the file that the scene also has. The second result maps their indices in the file to
+    their indices in the scene. Frame and convention are found as in :func:`read_held_out`.
     """
     stored, own_cameras = read_cameras(path), load.cameras
     conventions = [stored]  # the cameras of the file, read in each convention
@@ -104,7 +104,7 @@ def _find_photo_folder(path: Path, cameras: CameraFile, images: StrPath | None) 
 
 
 def _match_by_name(camera_file: CameraFile, names: tuple[str, ...]) -> dict[int, int]:
-    """Map views of a file to views of the scene with the same name, by index; empty if names are not unique.
+    """Map views of a file to views of the scene with the same name, by index; {} if names are not unique.
 
     Folders and endings of names are ignored.
     """
@@ -120,8 +120,8 @@ def _match_by_name(camera_file: CameraFile, names: tuple[str, ...]) -> dict[int,
 def _find_world(camera_file: CameraFile, load: Loaded) -> tuple[Similarity, dict[int, int]]:
     """Find the similarity from the file's world to the world of the Gaussians, and the views that the scene also has.
 
-    The second result maps views of the file to views of the scene with the same name, by index. It is empty if no
-    similarity brings the poses of these views together.
+    The second result maps views of the file to views of the scene with the same name, by index. The map is empty if no
+    similarity brings the two poses of all shared views together.
     """
     stored, shared = _find_similarity(load), _match_by_name(camera_file, load.scene.names)
     if not shared:
@@ -146,8 +146,9 @@ def _find_world(camera_file: CameraFile, load: Loaded) -> tuple[Similarity, dict
 def _find_similarity(load: Loaded) -> Similarity:
     """Find the similarity from the world of a scene's own camera file to the world of its Gaussians.
 
-    A camera file of held-out photos is assumed to be in the same world. The result is the identity if the scene has no
-    camera file, or if the poses in it cannot be compared with the poses of the scene.
+    A camera file of held-out photos is assumed to be in the world of the scene's camera file. The result is the
+    identity if the scene has no camera file, or if the poses in this file cannot be compared with the poses of the
+    scene.
     """
     if load.recovery is not None:
         return load.recovery.frame
@@ -166,8 +167,8 @@ def _match_by_pose(viewmats: np.ndarray, scene: Scene) -> dict[int, int]:
     if len(scene) == 0 or len(scene.gaussians) == 0:
         return {}
     ours, middle = scene.cameras.viewmats, np.median(scene.gaussians.means, 0)
-    # Largest difference of equal poses: of elements of their rotations, and of their centres as a share of the distance
-    # from the scene. There may be a single view, so distances between views cannot be used
+    # Equal poses differ by at most this in the elements of rotations, and in the centres as a share of the distance
+    # from the scene. Shifts are not compared with distances between views, because there may be a single view
     same_pose = 1e-4
     limit = same_pose * float(np.linalg.norm(camera_centres(ours) - middle, axis=1).max())
     same_place = np.linalg.norm(camera_centres(viewmats)[:, None] - camera_centres(ours), axis=2) <= limit

@@ -18,7 +18,7 @@ TOLERANCE = 1e-3  # opacities and images may lie outside [0, 1] by this much
 
 
 def as_scene(scene: Scene | StrPath) -> Scene:
-    """Return a scene unchanged after a check, or read it from a path; its notes go into the record of the run."""
+    """Check a scene and return it unchanged, or read it from a path; notes of reading go into the record of the run."""
     if isinstance(scene, Scene):
         check_scene(scene)
     else:
@@ -30,7 +30,7 @@ def as_scene(scene: Scene | StrPath) -> Scene:
 
 
 def check_scene(scene: Scene) -> None:
-    """Raise SceneError if the values of a scene have another convention. Scenes that callers make may have one."""
+    """Raise SceneError if values have another convention than gsmerge's, as in scenes that callers may make."""
     gaussians, cameras = vars(scene.gaussians), scene.cameras
     arrays = {**gaussians, "viewmats": cameras.viewmats, "Ks": cameras.Ks, "images": scene.images}
     for name, values in arrays.items():

@@ -1,4 +1,4 @@
-"""The type of a scene that was read from files, with all facts about these."""
+"""The type of a scene that was read from files, with all facts about these files."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from gsmerge.types import Scene
 
 @dataclass(frozen=True)
 class Loaded:
-    """A scene, with all facts about its files and how they were read."""
+    """A scene, with all facts about its files and how these files were read."""
 
     scene: Scene  # with pixels if the rows have them
     info: FileInfo  # header and encodings of the file of Gaussians
@@ -47,7 +47,7 @@ class Loaded:
 
     @property
     def comments(self) -> tuple[str, ...]:
-        """Comments of the file's header that a result copies. The comment on 2D Gaussians is not, as results are 3D."""
+        """Comments of the file's header that a result copies; all except that on 2D Gaussians, as results are 3D."""
         return tuple(comment for comment in kept_comments(self.info) if comment != FLAT_COMMENT)
 
     @property

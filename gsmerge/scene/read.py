@@ -1,6 +1,6 @@
 """Read a scene from its files: its Gaussians, the pixels of their rows, its cameras and its photos.
 
-A function returns a :class:`SceneError` instead of raising it if its caller can try to read the scene in another way.
+A function returns a :class:`SceneError` instead of raising it if the caller can try to read the scene in another way.
 """
 
 from __future__ import annotations
@@ -83,11 +83,12 @@ def read_scene(
 
     Args:
         path: The ``.ply``, or a folder that has it.
-        *more: Other scenes of the same place. They are joined with the first one, in its frame (docs/guide/sharp.md).
-        cameras: Camera file or folder, or "none". None: search beside the ``.ply``, and warn if the cameras do not fit.
-        images: Folder of images, an ``.npz`` that holds images, or "none". None: search as for cameras.
-        masks: Folder of images with the names of the photos, dark where a photo does not count, or "none". None: use
-            those that ``transforms.json`` names, or the folder ``masks`` beside the photos, and the photos'
+        *more: Other scenes of the same place, which are joined with the first, in its frame (docs/guide/sharp.md).
+        cameras: Camera file or folder, or "none". If None, cameras are searched beside the ``.ply``, with a warning if
+            they do not fit.
+        images: Folder of images, an ``.npz`` that holds images, or "none". If None, images are searched as cameras are.
+        masks: Folder of images with the names of the photos, dark where a photo does not count, or "none". If None, the
+            masks that ``transforms.json`` names are used, or the folder ``masks`` beside the photos, and the photos'
             transparency. Lighter greys are weights in a fit.
         protect: Folder of images with the names of the photos, white where a text or a face has to stay sharp; see
             :attr:`Scene.importance`.
@@ -99,7 +100,7 @@ def read_scene(
         The scene; its ``pixels`` are None if the pixels of the rows are unknown.
 
     Raises:
-        SceneError: If a file is missing or damaged, or the Gaussians do not belong to the views of named cameras.
+        SceneError: If a file is missing or damaged, or if the Gaussians do not belong to the views of named cameras.
         ValueError: If an argument has a value that is not possible.
 
     Example:
@@ -143,7 +144,7 @@ def load_files(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: Rea
 
 
 def _join_loads(loads: Sequence[Loaded], files: SceneFiles) -> Loaded:
-    """Join several scenes of the same place into one scene, which has the notes of all."""
+    """Join several scenes of the same place into one scene, which has the notes of all scenes."""
     from gsmerge.cameras.registration.join import join_scenes
 
     joined = join_scenes([load.scene for load in loads], [load.files.ply for load in loads])
@@ -168,7 +169,7 @@ def read_gaussian_file(files: SceneFiles, *, opacity: OpacityChoice, hints: Read
     If the hints name an exporter that writes logits, opacities are read as logits, unless ``opacity`` says otherwise.
     """
     exporter = find_exporter(hints.exporter)
-    # If the exporter writes raw opacities, they are not assumed, since some of its versions write logits
+    # Raw opacities are not assumed for an exporter that writes them, since some of its versions write logits
     if exporter is not None and exporter.opacity == "logit" and opacity == "auto":
         opacity = "logit"
     encodings: dict[str, Any] = {"opacity": opacity, "scales": hints.scales, "colors": hints.colors}
@@ -200,11 +201,11 @@ def align_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHints = NO_H
 def _read_without_cameras(
     ply: GaussianFile, files: SceneFiles, hints: ReadHints, result: Loaded | SceneError, *, photos: bool
 ) -> Loaded | SceneError:
-    """Read a scene without its camera file, and say so in a note; the rows then show the cameras themselves.
+    """Read a scene without its camera file, with a note; cameras are estimated from the rows instead.
 
-    ``result`` is what reading with the camera file gave: a scene with fewer views than the rows form, or an error. This
-    result is returned if the scene cannot be read without the file, or if photos that the caller named are not used
-    then.
+    ``result`` is what reading with the camera file gave: a scene with fewer views than the rows form, or an error.
+    ``result`` is returned if the scene cannot be read without the camera file, or if photos that the caller named would
+    not be used without it.
     """
     remaining = replace(files, cameras=None, images=None if files.images == files.cameras else files.images)
     load = _read_views(ply, remaining, hints, photos=photos)
@@ -223,7 +224,8 @@ def _read_without_cameras(
 def _choose_cameras(ply: GaussianFile, files: SceneFiles, hints: ReadHints, *, photos: bool) -> Loaded | SceneError:
     """Read a scene with the first of its camera files that certainly fits, or else with the first that can be read.
 
-    If there are several camera files, a note says which one is read. Returns the first error if none can be read.
+    If there are several camera files, a note says which one is read. Returns the first error if the scene can be read
+    with no camera file.
     """
     loads, errors = list[Loaded](), list[SceneError]()
     for choice in files.choices:
@@ -241,9 +243,10 @@ def _choose_cameras(ply: GaussianFile, files: SceneFiles, hints: ReadHints, *, p
 def _cameras_certainly_fit(load: Loaded, files: SceneFiles) -> bool:
     """Return whether the cameras of a scene certainly fit its Gaussians, so that no other cameras have to be tried.
 
-    - With photos: if rows are pixels of the cameras, if the photos show the views, or if there are no other cameras.
-    - Without photos: if rows are pixels of the cameras, or if nothing is doubtful. But if the other cameras lie in
-      folders below the scene, only photos can show which cameras fit.
+    - In a scene with photos, cameras certainly fit if rows are their pixels, if the photos show the views, or if there
+      are no other cameras.
+    - In a scene without photos, cameras certainly fit if no other cameras lie in folders below the scene, and if rows
+      are pixels of the cameras or the scene has no doubts.
     """
     if load.scene.images is None:
         return not files.below and (load.scene.has_own_pixels or not load.doubts)
@@ -261,8 +264,8 @@ def _read_or_error(read: Callable[[], T]) -> T | SceneError:
 def _note_left_out(load: Loaded, files: SceneFiles, left_out: list[str], cause: SceneError) -> Loaded:
     """Return a scene with a doubt which says what is left out, why, and what the user can do.
 
-    ``left_out`` describes files in words. If photos are not used without these files, the doubt also names the photos,
-    and replaces the notes on them.
+    ``left_out`` describes these files in words. If photos are not used without these files, the doubt also names the
+    photos, and replaces the notes on photos.
     """
     photos = f"the photos in {files.images or files.ply.parent}"
     photo_notes = tuple(text for text in load.notes if text.startswith(f"{photos} are not used"))
@@ -279,7 +282,7 @@ def _note_left_out(load: Loaded, files: SceneFiles, left_out: list[str], cause: 
 
 
 def _read_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints, *, photos: bool) -> Loaded | SceneError:
-    """Combine a scene's Gaussians with its cameras and photos, if it has any; return the error if they do not fit."""
+    """Combine a scene's Gaussians with its cameras and photos, if any; return the error if they do not fit together."""
     camera_file = _read_or_error(partial(read_scene_cameras, ply, files))
     if camera_file is None:
         return _make_scene_without_views(ply, files, hints)
@@ -294,9 +297,9 @@ def _add_photos(
 ) -> Loaded | SceneError:
     """Combine Gaussians and cameras with their photos; return the error if the cameras do not see the Gaussians.
 
-    Photos are files of their own, or all are inside one file. Photos that the caller did not name are left out, with a
-    note, if they cannot be read or do not show the views; see :func:`_leave_out_photos`. If ``photos`` is False, all
-    photos are left out.
+    Photos are files of their own, or all photos are inside one file. Photos that the caller did not name are left out,
+    with a note, if they cannot be read or do not show the views; see :func:`_leave_out_photos`. If ``photos`` is False,
+    all photos are left out.
     """
     proposal = _read_or_error(partial(propose_photos, files, camera_file)) if photos else None
     if isinstance(proposal, Proposal) and proposal.by_names:
@@ -314,7 +317,7 @@ def _add_photos(
     if error is not None:
         return _note_left_out(load, files, [f"the photos in {files.images}"], error)
     lacks_photos = photos and "images" not in files.named and load.scene.images is None
-    is_result = RESULT_COMMENT in ply.info.comments or result_cameras(files.ply)  # films beside a result are of it
+    is_result = RESULT_COMMENT in ply.info.comments or result_cameras(files.ply)  # films beside a result show it
     notes_on_films = describe_unread(files.ply.parent, IMAGE_PLACES) if lacks_photos and not is_result else []
     return replace(load, notes=(*load.notes, *notes_on_films))
 
@@ -324,7 +327,7 @@ def _add_proposed_photos(
 ) -> Loaded | SceneError:
     """Combine Gaussians and cameras with all proposed photos, or only with photos of the most frequent aspect ratio.
 
-    If neither can be used, all photos are left out; see :func:`_leave_out_photos`.
+    If even photos of one aspect ratio cannot be used, all photos are left out; see :func:`_leave_out_photos`.
     """
     make_scene = partial(_make_scene_with_views, ply, files, hints)
     load = _assign_photos(make_scene, camera_file, proposal)
@@ -341,12 +344,12 @@ def _add_proposed_photos(
 def _assign_photos(make_scene: MakeScene, camera_file: CameraFile, proposal: Proposal) -> Loaded | SceneError:
     """Make a scene with the photos that names propose, or with other photos that show its views.
 
-    1. If the photos have another shape than the cameras, parts of the photos may show the views, and are used then.
-    2. The scene is read with the proposed photos, or without photos if these cannot be used.
-    3. The views of this scene show which photo belongs to each. If parts of the photos fit better, the parts are used.
+    1. If the photos have another shape than the cameras, parts of the photos are used if they show the views.
+    2. The scene is read with the proposed photos, or if these photos cannot be used, without photos.
+    3. The views of this scene decide which photo belongs to a view. Parts of photos are used if the parts fit better.
     4. The scene is read again if other photos belong to the views than were proposed.
 
-    Notes name photos that cannot be read, and views without a photo. Returns the error if no photo shows any view.
+    Notes name photos that cannot be read, and views without a photo. Returns an error if no photo shows a view.
     """
     has_no_names = is_without_names(camera_file)
     shapes_differ = not has_no_names and has_other_shape(proposal, camera_file)
@@ -374,7 +377,7 @@ def _assign_photos(make_scene: MakeScene, camera_file: CameraFile, proposal: Pro
         if isinstance(proposed, SceneError) and (not shapes_differ or any(camera_file.lenses)):
             return proposed
         return explain_mismatch(proposal, camera_file)
-    # 4. The scene with the photos of its views, unless these were proposed
+    # 4. The scene with the photos of its views, unless the same photos were proposed
     load: Loaded | SceneError = base
     if base is not proposed or chosen != proposal.choice:
         load = _make_with_photos(make_scene, name_by_photos(camera_file, photos), proposal, chosen)
@@ -387,7 +390,7 @@ def _assign_photos(make_scene: MakeScene, camera_file: CameraFile, proposal: Pro
 def _make_with_proposed_photos(
     make_scene: MakeScene, camera_file: CameraFile, proposal: Proposal
 ) -> tuple[Loaded | SceneError, Proposal]:
-    """Make a scene with all proposed photos, or with those that are not broken; also return the proposal then used."""
+    """Make a scene with all proposed photos, or with those that are not broken; also return the proposal used."""
     load = _make_with_photos(make_scene, camera_file, proposal, proposal.choice)
     unbroken = proposal.without_broken() if isinstance(load, SceneError) else None
     if unbroken is None:
@@ -410,11 +413,12 @@ def _leave_out_photos(
     hints: ReadHints,
     cause: SceneError,
 ) -> Loaded | SceneError:
-    """Combine Gaussians and cameras without their photos, with a note; return the error if photos must not be left out.
+    """Combine Gaussians and cameras without photos, with a note; return ``cause`` if photos must not be left out.
 
     ``cause`` says why photos and cameras do not fit each other. Photos that the caller named are never left out. Other
-    photos are left out if it is certain that the cameras belong to the scene: if rows are their pixels, if the cause is
-    a photo, or if the photos were found by the cameras' names. Cameras of another scene may also see these Gaussians.
+    photos are left out if it is certain that the cameras belong to the scene: if rows are pixels of the cameras, if the
+    cause is a photo, or if the photos were found by the cameras' names. That cameras see the Gaussians is no proof,
+    because cameras of another scene may see them, too.
     """
     are_named = "images" in files.named
     if are_named and "cameras" not in files.named and cause.path == camera_file.path:
@@ -439,7 +443,7 @@ def _is_fault_of_named(files: SceneFiles, cause: SceneError) -> bool:
 def _make_scene_with_views(
     ply: GaussianFile, files: SceneFiles, hints: ReadHints, camera_file: CameraFile, photos: ScenePhotos
 ) -> Loaded:
-    """Combine Gaussians, cameras and their photos. Raises SceneError if any of them cannot be used."""
+    """Combine Gaussians, cameras and photos. Raises SceneError if the cameras or the photos cannot be used."""
     order = _choose_row_order(ply, camera_file, hints)
     pinholes, pictures, notes = as_pinholes(camera_file, photos.pictures)
     pinholes = at_own_size(pinholes, photo_size(pictures))
@@ -484,7 +488,7 @@ def _choose_row_order(ply: GaussianFile, camera_file: CameraFile, hints: ReadHin
 
 
 def _make_scene_without_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> Loaded:
-    """Make a scene without views, which a run places later. A note says that photos are not used."""
+    """Make a scene without views; a run places views later. A note says that photos are not used."""
     advice = find_cameras_of_model(ply.info)
     notes = [advice] if advice else []
     _check_hints(ply, hints)
@@ -500,7 +504,7 @@ def _make_scene_without_views(ply: GaussianFile, files: SceneFiles, hints: ReadH
 
 
 def _check_hints(ply: GaussianFile, hints: ReadHints) -> None:
-    """Raise SceneError if a hint says that rows are pixels. Called for rows that have no pixels."""
+    """For rows that have no pixels, raise SceneError if a hint says that rows are pixels."""
     if hints.order not in ("auto", "none"):
         problem = f"expected rows that are pixels of views, as --hint order={hints.order} says, found others"
         raise SceneError(ply.info.path, problem, "leave the hint out, or name the cameras that fit with --cameras")
@@ -519,7 +523,7 @@ def _make_loaded(
     """Make a scene of the visible Gaussians and all views, with all facts about how it was read.
 
     ``result`` has the cameras, the photos, and the pixels of the rows. ``large`` has the larger photos of the views,
-    and ``masks`` has their masks. ``absent`` lists the cameras without a photo.
+    and ``masks`` the masks of the photos. ``absent`` lists the cameras without a photo.
     """
     camera_file, recovery = result.camera_file, result.recovery
     gaussians, pixels = take_gaussians(ply, result)
@@ -561,8 +565,9 @@ def _make_loaded(
 def move_cameras_to_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHints, photos: bool) -> Loaded:
     """Read a scene with its cameras moved into the frame of the Gaussians, if pixels or colours show that frame.
 
-    Otherwise the cameras stay as stored in their file. If ``photos`` is False, no photos are needed. If it is True,
-    named photos that cannot be read raise SceneError. Named cameras without a size also do.
+    If nothing shows that frame, the cameras stay as stored in their file. If ``photos`` is False, no photos are needed.
+    If ``photos`` is True, named photos that cannot be read raise SceneError. Named cameras without a size raise
+    SceneError, too.
     """
     for with_photos in dict.fromkeys((True, photos)):  # photos help to find the frame even if they are not needed
         load = _choose_cameras(ply, files, hints, photos=with_photos)
@@ -573,7 +578,7 @@ def move_cameras_to_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHi
         kept = _read_or_error(partial(_keep_stored_cameras, ply, files, camera_file, hints, photos=photos))
         if isinstance(kept, Loaded):
             return kept
-    return align_scene(ply, files, hints=hints, photos=photos)  # leaves out files that were not named
+    return align_scene(ply, files, hints=hints, photos=photos)  # this leaves out files that were not named
 
 
 def _keep_stored_cameras(
@@ -581,7 +586,7 @@ def _keep_stored_cameras(
 ) -> Loaded | None:
     """Return the scene with the cameras as stored in their file, and a doubt that they do not fit.
 
-    Returns None if the caller did not name these cameras, and they do not see the Gaussians.
+    Returns None for cameras that the caller did not name and that do not see the Gaussians.
     """
     from gsmerge.cameras import check_cameras  # few scenes need it
 

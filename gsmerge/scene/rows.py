@@ -23,7 +23,7 @@ _BLOCK = 1 << 20  # numbers that are compared at once
 def take_gaussians(ply: GaussianFile, result: AlignmentResult) -> tuple[Gaussians, Pixels | None]:
     """Return the visible Gaussians of a file, sorted by their pixels, and these pixels; None for unknown pixels.
 
-    If all Gaussians are too faint to be drawn, all valid rows are returned.
+    If all Gaussians are too faint to be drawn, the Gaussians of all valid rows are returned.
     """
     is_visible = ply.valid & (ply.gaussians.opacities >= LEAST_OPACITY)
     taken = is_visible if is_visible.any() else ply.valid
@@ -55,12 +55,12 @@ def take_gaussians(ply: GaussianFile, result: AlignmentResult) -> tuple[Gaussian
 
 
 def _increases(ids: np.ndarray) -> bool:
-    """Return whether each number is larger than the one before."""
+    """Return whether each number is larger than the number before."""
     return bool((ids[1:] > ids[:-1]).all())
 
 
 def _counts_up(ids: np.ndarray) -> bool:
-    """Return whether numbers are 0, 1, 2, ... They are compared block by block, which takes less memory."""
+    """Return whether numbers are 0, 1, 2, ...; the comparison goes block by block, which takes less memory."""
     blocks = ((first, ids[first : first + _BLOCK]) for first in range(0, len(ids), _BLOCK))
     return all(np.array_equal(block, np.arange(first, first + len(block), dtype=ids.dtype)) for first, block in blocks)
 
@@ -78,7 +78,7 @@ def _read_as_rgb(scene: Scene, units: ColorUnits) -> Scene:
 
 
 def confirm_colors(load: Loaded) -> Loaded:
-    """Read colours as RGB instead of harmonics, or the other way round, if the file allows both and photos show it."""
+    """Read colours as RGB instead of harmonics, or vice versa, if the file allows both and the photos fit better."""
     old_info, units = load.info, load.info.open_units
     if units is None or load.scene.images is None:
         return load

@@ -25,12 +25,12 @@ from gsmerge.photos.masks import NO_MASKS, Masks, read_masks
 from gsmerge.photos.scene_photos import ScenePhotos
 from gsmerge.types import Cameras, LargePhotos
 
-_MAX_BYTES = 2 << 30  # photos of at most this size, as floats, are not resized unless rows have no pixels
+_MAX_BYTES = 2 << 30  # photos of at most this size, as floats, are resized only if rows have no pixels
 _EDGE_ROUNDING = 1e-6  # pixels by which the edge of a window may be off
 
 
 def read_scene_cameras(ply: GaussianFile, files: SceneFiles) -> CameraFile | None:
-    """Read a scene's cameras from their file or the ``.ply``, or estimate them from the rows; None if there are none.
+    """Read a scene's cameras from their file or the ``.ply``, or estimate them from the rows; None if that fails.
 
     Repeated views are dropped, unless the number of rows is a multiple of the number of views. Raises SceneError if a
     file has poses, but no focal length.
@@ -39,7 +39,7 @@ def read_scene_cameras(ply: GaussianFile, files: SceneFiles) -> CameraFile | Non
         stored = read_cameras(files.cameras, folder=files.ply.parent)
         if not stored.has_intrinsics:
             raise missing_intrinsics(stored.path)
-        # if rows are a multiple of views, repeated views may also have rows of their own
+        # repeated views may have rows of their own if the number of rows is a multiple of the number of views
         return drop_repeats(stored) if len(ply.gaussians) % len(stored) else stored
     if files.is_state:  # cameras of a state are in its own file, or there are none
         return None
@@ -69,7 +69,7 @@ def find_larger_and_masks(
         camera_file: The cameras as stored, with lenses.
         photos: The photos of these cameras.
         size: Size of the undistorted photos; None without photos.
-        transform: How photos were resized and cropped to the pixels of the rows; None if they were not changed.
+        transform: How photos were resized and cropped to the pixels of the rows; None if photos were not changed.
         cameras: The scene's cameras, in the order of the camera file.
 
     Returns:
@@ -114,7 +114,7 @@ class _Window:
 def _file_window(stored: Size, size: Size, transform: PhotoTransform | None, cameras: Cameras) -> _Window:
     """Find the part of a photo's file that the view shows, for files of the size ``stored``.
 
-    The other parameters are those of :func:`find_larger_and_masks`.
+    ``size``, ``transform`` and ``cameras`` are as in :func:`find_larger_and_masks`.
     """
     # all arrays hold x and y
     to_grid = transform or resize_to(size, size)
@@ -135,9 +135,9 @@ def limit_photo_size(
 ) -> tuple[PhotoArrays, list[str]]:
     """Resize photos that are too large for memory to at most ``max_side`` pixels per side; return them and notes.
 
-    Photos that fit into memory keep their size. Photos also keep it if their pixels are less than twice as many as the
-    rows, because the rows may be these pixels. If ``unaligned`` is True, the rows are known to have no pixels, so
-    photos are resized whatever memory they take.
+    Photos that fit into memory keep their size. Photos also keep their size if they have less than twice as many pixels
+    as there are rows, because the rows may be these pixels. If ``unaligned`` is True, the rows are known to have no
+    pixels, so photos are resized whatever memory they take.
     """
     size = photo_size(photos)
     if size is None:
@@ -154,7 +154,7 @@ def limit_view_size(cameras: Cameras, images: np.ndarray, max_side: int) -> tupl
     """Resize cameras and photos ``[c,h,w,3]`` to at most ``max_side`` pixels per side; return them and a note.
 
     The function :func:`gsmerge.measure.sizes.shrink_views` chooses the same size, but resizes photos as renders are
-    resized. This function resizes photos as the photos of files are resized.
+    resized. :func:`limit_view_size` resizes photos as the photos of files are resized.
     """
     transform, notes = _choose_reduction((cameras.width, cameras.height), max_side)
     if transform is not None:
@@ -166,7 +166,7 @@ def limit_view_size(cameras: Cameras, images: np.ndarray, max_side: int) -> tupl
 
 
 def _choose_reduction(size: Size, max_side: int) -> tuple[PhotoTransform | None, list[str]]:
-    """Return how pictures are reduced to ``max_side`` pixels per side, and a note; None if they are small enough."""
+    """Return how pictures are reduced to ``max_side`` pixels per side, and a note; None for pictures small enough."""
     smaller = limit_size(size, max_side)
     if smaller == size:
         return None, []

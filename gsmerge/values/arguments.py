@@ -15,7 +15,7 @@ from typing import Any, TypeVar, cast
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-# Name in annotations -> its words in messages, and a function that tests a value. CLASSES are all other known names
+# Name in annotations -> words for it in messages, and a function that tests a value. CLASSES are all other known names
 ARGUMENT_KINDS: Mapping[str, tuple[str, Callable[[Any], bool]]] = {
     "None": ("", lambda value: value is None),
     "StrPath": ("a path", lambda value: isinstance(value, str | os.PathLike)),
@@ -30,7 +30,7 @@ CLASSES = (
     "Pixels", "LargePhotos", "Region", "Scene", "Gaussians", "Cameras", "Views", "CameraFile", "CompactOptions",
     "EvaluateOptions",
 )  # fmt: skip
-# Beginning of the annotation of a container -> the types that its values may have
+# Beginning of the annotation of a container -> the types that count as this container
 CONTAINERS = {"Mapping[str, ": Mapping, "Sequence[": list | tuple, "tuple[": list | tuple}
 REMEDIES = {
     "Scene": "gsmerge.read_scene(path) reads one; tensors go to gsmerge.compact_tensors",
@@ -39,7 +39,7 @@ REMEDIES = {
 
 
 def check_arguments(function: Function) -> Function:
-    """Decorate a public function, so that arguments of other types than it declares raise a TypeError of one line.
+    """Decorate a public function, so that arguments of other types than declared raise a TypeError of one line.
 
     A parameter is checked if its annotation consists of names from :data:`ARGUMENT_KINDS` and :data:`CLASSES`, or of
     lists and mappings of these.
@@ -68,7 +68,7 @@ def check_fields(value: Any) -> None:
 
 @cache
 def _split_annotation(annotation: str) -> list[tuple[str, str]]:
-    """Split an annotation at each |; return the container of each part ("" for none) and the name inside it."""
+    """Split an annotation at each |; return the container of each part ("" for none) and the name in the container."""
     matches = [re.fullmatch(r"(Mapping\[str, |Sequence\[|tuple\[)?(.*?)(?:, \.\.\.)?\]?", part.strip())
                for part in re.split(r"\|(?![^\[]*\])", annotation)]  # fmt: skip
     return [(match[1] or "", match[2]) for match in matches if match]

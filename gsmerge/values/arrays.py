@@ -14,11 +14,11 @@ from gsmerge.errors import SceneError, refuse_without_torch
 if TYPE_CHECKING:
     import torch
 
-Array = NDArray[Any]  # or a torch tensor if a docstring allows one; type checkers do not see that
+Array = NDArray[Any]  # or a torch tensor if a docstring allows tensors, which type checkers do not see
 
 
 class ArrayFields:
-    """Base of dataclasses of arrays: ``==`` compares all values and gives one boolean, where arrays give an array."""
+    """Base of dataclasses of arrays, whose ``==`` gives one boolean; on the arrays alone it would give an array."""
 
     def __eq__(self, other: object) -> bool:
         if other.__class__ is not self.__class__:
@@ -81,7 +81,7 @@ def as_index(rows: str, index: Any) -> Any:
 
 
 def as_array(values: Any) -> np.ndarray:
-    """Return an array, or a tensor on any device, as a NumPy array without gradient; copy it only if needed.
+    """Return an array, or a tensor on any device, as a NumPy array without gradient; copy only if needed.
 
     A tensor's floats of less than 32 bits become float32, because NumPy lacks some of their types.
     """
@@ -116,7 +116,7 @@ def as_tensor(values: Array, device: torch.device | str = "cpu") -> torch.Tensor
 
 
 def distinct(values: np.ndarray) -> np.ndarray:
-    """Return the distinct values of an array ``[n]``, ascending; ``np.unique`` takes several times as long."""
+    """Return the distinct values of an array ``[n]``, ascending, like ``np.unique``, but several times as fast."""
     ordered = np.sort(values)
     is_new = np.ones(len(ordered), bool)
     np.not_equal(ordered[1:], ordered[:-1], out=is_new[1:])
@@ -124,7 +124,7 @@ def distinct(values: np.ndarray) -> np.ndarray:
 
 
 def to_float32(values: np.ndarray) -> np.ndarray:
-    """Round an array to float32; numbers beyond its range become infinite."""
+    """Round an array to float32; numbers beyond the range of float32 become infinite."""
     with np.errstate(over="ignore"):
         return values.astype(np.float32, order="C")
 
@@ -149,7 +149,7 @@ def concat_columns(parts: Sequence[Array]) -> Array:
 
 
 def is_equal(one: Any, other: Any) -> bool:
-    """Return whether two values are equal. Arrays and tensors are equal if shapes and numbers are; NaN equals NaN."""
+    """Return whether two values are equal, for arrays and tensors in shape and in all numbers; NaN equals NaN."""
     if one is other:
         return True
     if getattr(one, "ndim", 0) or getattr(other, "ndim", 0):
@@ -159,5 +159,5 @@ def is_equal(one: Any, other: Any) -> bool:
 
 
 def shorten(value: Any) -> str:
-    """Describe a value in one line; of an array or a tensor, only its type and shape."""
+    """Describe a value in one line; an array or a tensor only by its type and shape."""
     return f"{type(value).__name__}{list(value.shape)}" if getattr(value, "ndim", 0) else repr(value)

@@ -24,18 +24,18 @@ class JoinedScene:
 
     scene: Scene
     used: tuple[int, ...]  # numbers of the input scenes that are joined
-    names: tuple[str, ...]  # of all input scenes, for messages
-    notes: tuple[str, ...]  # for the user, one sentence each
+    names: tuple[str, ...]  # names of all input scenes, for messages
+    notes: tuple[str, ...]  # notes for the user, one sentence each
     # For each input scene its path, and whether it was joined. A joined scene also has the number of keypoints by which
     # it was registered, the angle of its rotation in degrees, its scale, and the shift of its origin
     facts: tuple[dict[str, Any], ...]
 
 
 def join_scenes(scenes: Sequence[Scene], paths: Sequence[Path]) -> JoinedScene:
-    """Join scenes of one place into one scene. All have pixels, and each has a frame and a scale of its own.
+    """Join scenes of one place, which have pixels, and frames and scales of their own, into one scene.
 
-    ``paths`` are their files, for messages. Raises SceneError if a scene has no pixels, if views or harmonics differ in
-    size, or if no two scenes show the same surfaces.
+    ``paths`` are the files of the scenes, for messages. Raises SceneError if a scene has no pixels, if views or
+    harmonics differ in size, or if no two scenes show the same surfaces.
     """
     _check_joinable(scenes, paths)
     registration = register(scenes)
@@ -105,10 +105,10 @@ def move_scene(scene: Scene, similarity: Similarity) -> Scene:
 
 
 def concat_scenes(scenes: Sequence[Scene], photos: np.ndarray | None = None) -> Scene:
-    """Concatenate the views of scenes of one size and frame; the result has pixels if all scenes do.
+    """Concatenate the views of scenes of one size and frame; the result has pixels if all scenes have pixels.
 
-    ``photos [v,h,w,3]`` are the photos of all views, if they are in one array already. Otherwise the result has photos
-    if all scenes do.
+    ``photos [v,h,w,3]`` are the photos of all views, if they are in one array already. Without ``photos``, the result
+    has photos if all scenes have photos.
     """
     cameras = Cameras(
         np.concatenate([scene.cameras.viewmats for scene in scenes]),
@@ -147,7 +147,7 @@ def _concat_pixels(scenes: Sequence[Scene]) -> Pixels | None:
 
 
 def _concat_filled(scenes: Sequence[Scene]) -> np.ndarray | None:
-    """Concatenate the masks ``[n]`` of Gaussians that fill holes; None if no Gaussian does."""
+    """Concatenate the masks ``[n]`` of Gaussians that fill holes; None if no Gaussian fills a hole."""
     if all(scene.filled is None for scene in scenes):
         return None
     masks = [np.zeros(len(scene.gaussians), bool) if scene.filled is None else scene.filled for scene in scenes]
@@ -168,14 +168,14 @@ def _concat_values(
 
 
 def _concat_large(photos: Sequence[LargePhotos | None]) -> LargePhotos | None:
-    """Concatenate the large photos of scenes; None if a scene has none, or if their sizes differ."""
+    """Concatenate the large photos of scenes; None if a scene has no large photos, or if sizes differ."""
     sources = [source for source in photos if source is not None]
     if len(sources) < len(photos) or len({(source.width, source.height) for source in sources}) > 1:
         return None
     source_views = [(source, source_view) for source in sources for source_view in source.ids]
 
     def read(view: int) -> np.ndarray:
-        """Read the photo of a view from the source of its scene."""
+        """Read the large photo of a view as its scene reads it."""
         source, source_view = source_views[view]
         return source.read(source_view)
 

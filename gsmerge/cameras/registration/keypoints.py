@@ -26,7 +26,7 @@ class PhotoKeypoints:
     pixels: np.ndarray  # [n,2] positions in the scene's grid
     points: np.ndarray  # [n,3] float64, in the scene's frame
     descriptors: np.ndarray  # [n,128] float32, whole numbers up to 255
-    viewmat: np.ndarray  # [4,4] float64, of the photo's camera in the scene's frame
+    viewmat: np.ndarray  # [4,4] float64, pose of the photo's camera in the scene's frame
     K: np.ndarray  # [3,3] of this camera
 
 
@@ -36,7 +36,7 @@ class MatchSide:
 
     points: np.ndarray  # [m,3] in the scene's frame
     pixels: np.ndarray  # [m,2] positions in the scene's grid
-    viewmats: np.ndarray  # [m,4,4] of the camera that shows each keypoint
+    viewmats: np.ndarray  # [m,4,4] pose of the camera that shows each keypoint
     Ks: np.ndarray  # [m,3,3] of this camera
 
     def select(self, mask: np.ndarray) -> MatchSide:
@@ -121,7 +121,7 @@ def _detect_keypoints(picture: np.ndarray, stretch: float) -> tuple[np.ndarray, 
 
 @contextmanager
 def _equal_on_any_processor() -> Iterator[None]:
-    """Let OpenCV use only instructions that all processors have in the block, so that keypoints are equal on all."""
+    """Within the block, let OpenCV use only instructions of all processors, so that keypoints are equal on all."""
     before = cv2.useOptimized()
     cv2.setUseOptimized(False)
     try:
@@ -131,17 +131,14 @@ def _equal_on_any_processor() -> Iterator[None]:
 
 
 def _surface_depths(scene: Scene, view: int, viewmat: np.ndarray) -> np.ndarray:
-    """Return the depth ``[h,w]`` of the front Gaussian of each pixel of a view; infinite if a pixel has none."""
+    """Return the depth ``[h,w]`` of the front Gaussian of each pixel of a view; infinite without a Gaussian."""
     rows = scene.get_pixels().fronts[view]
     depths = camera_depths(scene.gaussians.means[rows].astype(np.float64), viewmat)
     return np.asarray(np.where((rows >= 0) & (depths > 0), depths, np.inf))
 
 
 def _depths_at(depths: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the median depth ``[n]`` of the 3 x 3 pixels around ``pixels [n,2]``, and a mask ``[n]``.
-
-    The mask is True if the 3 x 3 pixels show one surface.
-    """
+    """Return the median depth ``[n]`` of 3 x 3 pixels around ``pixels [n,2]``, and whether these show one surface."""
     padded = np.pad(depths, 1, mode="edge")
     height, width = depths.shape
     x = np.floor(pixels[:, 0]).astype(int).clip(0, width - 1)
@@ -169,7 +166,7 @@ def match_photos(
 
 
 def _make_side(photos: Sequence[PhotoKeypoints], rows: Sequence[np.ndarray]) -> MatchSide:
-    """Collect the matched keypoints of photos, whose indices in each photo are ``rows``."""
+    """Collect the keypoints that have a match, of which ``rows`` are the indices in each photo."""
     photo_rows = list(zip(photos, rows, strict=True))
     counts = [len(ids) for ids in rows]
     return MatchSide(
@@ -181,11 +178,11 @@ def _make_side(photos: Sequence[PhotoKeypoints], rows: Sequence[np.ndarray]) -> 
 
 
 def _match_descriptors(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Match descriptors ``a`` and ``b``; return the rows of ``a`` that match, and their rows of ``b``.
+    """Match descriptors ``a`` and ``b``; return the rows of ``a`` that have a match, and the matching rows of ``b``.
 
     Two descriptors match if each is the best match of the other, and clearly better than the second-best match.
     """
-    if min(len(a), len(b)) < 2:  # there is no second best
+    if min(len(a), len(b)) < 2:  # without a second-best match nothing can be decided
         return np.empty(0, int), np.empty(0, int)
     # all sums are whole numbers below 2^24, so float32 is exact in any order of summation
     distances = (a * a).sum(1)[:, None] + (b * b).sum(1) - 2 * (a @ b.T)

@@ -1,10 +1,10 @@
 """Register scenes of one place: find the similarities between their frames from photos and depths.
 
-A keypoint is a point of its scene, at the depth of the Gaussian in its pixel. If keypoints of photos of two scenes
-match, their points are the same. Three matches determine a similarity (Umeyama 1991). Similarities are fitted to random
-triples, and the similarity that agrees with most matches is chosen. Then all scenes are moved at once by Gauss-Newton
-steps, until points project to their keypoints in the other photos. A single depth may be wrong. So residuals allow a
-point to move along its ray, within the standard deviation of depths.
+A keypoint is a point of its scene, at the depth of the Gaussian in its pixel. If keypoints in photos of two scenes
+match, their points are the same place. Three matches of keypoints determine a similarity (Umeyama 1991). Similarities
+are fitted to random triples, and the similarity that agrees with most matches is chosen. Then all scenes are moved at
+once by Gauss-Newton steps, until points project to their keypoints in the other photos. Because a single depth may be
+wrong, residuals allow a point to move along its ray, within the standard deviation of depths.
 """
 
 from __future__ import annotations
@@ -41,15 +41,15 @@ from gsmerge.types import Scene
 DEPTH_SPREAD = 0.1  # standard deviation of the logarithm of a depth, before it is measured
 NORMAL_2D = 1 / 1.1774  # standard deviation of two normal components, divided by the median length of their vector
 AGREE = 9.0  # largest squared residual of a match that agrees; residuals are in standard deviations
-# Largest squared residual of the matches that each round uses, divided by AGREE. The first are large, because errors
-# add up along a chain of scenes
+# Largest squared residual of the matches that each round uses, divided by AGREE. The first rounds allow large
+# residuals, because errors add up along a chain of scenes
 LOOSE = (100.0, 10.0, 2.0, 2.0)
 MIN_MATCHES = 16  # least number of agreeing matches of two connected scenes; unrelated photos have up to 5
 SIMILARITY_DAMPING = Damping(steps=40, first=1e-4, decrease=0.1, increase=10.0, largest=1e6, min_gain=1e-9)
 NUM_PARAMETERS = 7  # parameters of a step: rotation, shift, logarithm of the scale
 
 Similarities = Sequence[Similarity | None]
-# Similarities, and the cost of their residuals with its curvature and slope; see _normal_equations
+# Similarities, and the cost of their residuals with the cost's curvature and slope; see _normal_equations
 _SimilarityFit = tuple[Similarities, tuple[float, np.ndarray, np.ndarray]]
 
 
@@ -57,15 +57,15 @@ _SimilarityFit = tuple[Similarities, tuple[float, np.ndarray, np.ndarray]]
 class Registration:
     """Similarities from each scene's frame to the frame of the first scene of the largest connected set."""
 
-    similarities: tuple[Similarity | None, ...]  # of each scene; None if it is not connected
+    similarities: tuple[Similarity | None, ...]  # similarity of each scene; None for a scene that is not connected
     matches: tuple[int, ...]  # number of agreeing matches of each scene
 
 
 def register(scenes: Sequence[Scene]) -> Registration:
     """Find the similarities that map scenes into the frame of the first connected scene.
 
-    Scenes are connected if enough keypoints of their photos match. If they form several connected sets, the largest is
-    used. All scenes have pixels, and grids of one size.
+    Scenes are connected if enough keypoints of their photos match. If scenes form several connected sets, the largest
+    set is used. All scenes have pixels, and grids of one size.
     """
     count, cameras = len(scenes), scenes[0].cameras
     photos = [find_keypoints(scene) for scene in scenes]
@@ -95,7 +95,7 @@ def register(scenes: Sequence[Scene]) -> Registration:
 def connect(matches: KeypointMatches) -> tuple[Similarity, KeypointMatches] | None:
     """Find the similarity from the first scene to the second that agrees with the most matches.
 
-    Returns the similarity and the matches that agree; None if too few agree.
+    Returns the similarity and the matches that agree; None if too few matches agree.
     """
     if len(matches) < MIN_MATCHES:
         return None
@@ -159,10 +159,10 @@ class _Residuals:
 def _one_way_residuals(
     similarity: Similarity, side: MatchSide, other: MatchSide, pixels: float, spread: float
 ) -> _Residuals:
-    """Compute the errors between projected points of one side and the keypoints of the other.
+    """Compute the errors between projected points of the scene ``side`` and the keypoints of the scene ``other``.
 
-    ``similarity`` maps from the frame of ``side`` to the frame of ``other``. The errors are in standard deviations.
-    A keypoint has the standard deviation ``pixels``, and the logarithm of a depth has ``spread``.
+    ``similarity`` maps from the frame of ``side`` to the frame of ``other``. The errors are in standard deviations. A
+    keypoint has the standard deviation ``pixels``, and the logarithm of a depth has the standard deviation ``spread``.
     """
     rotmats = other.viewmats[:, :3, :3]
     moved = similarity.move_points(side.points)
@@ -171,7 +171,7 @@ def _one_way_residuals(
     projected = transform(other.Ks, camera)[:, :2] / z[:, None]
     by_camera = np.zeros((len(moved), 3, 3))
     by_camera[:, :2] = (other.Ks[:, :2] - projected[..., None] * np.eye(3)[2]) / z[:, None, None]
-    # a depth that is wrong by one standard deviation shifts the position in the photo by a streak
+    # a depth that is wrong by one standard deviation shifts the projected point by a vector, the streak
     side_rotmats = side.viewmats[:, :3, :3]
     centres = -transform(side_rotmats.swapaxes(1, 2), side.viewmats[:, :3, 3])
     rays = similarity.scale * transform(rotmats, matmul(side.points - centres, similarity.rotation.T))
@@ -187,19 +187,25 @@ def _one_way_residuals(
     ratios = log(z / camera_depths(other.points, other.viewmats))
     values = np.empty((len(moved), 3))
     values[:, :2] = transform(whiten, projected - other.pixels)
-    behind = 1e3  # replaces the logarithm of the depth ratio of points behind the camera
+    behind = 1e3  # error of points behind the camera, whose depth ratio has no logarithm
     values[:, 2] = np.where(camera[:, 2] > 0, ratios, behind) / depth_share
     return _Residuals(moved, values, matmul(by_camera, rotmats))
 
 
 def _squared_residuals(similarities: Similarities, matches: KeypointMatches, spread: float) -> np.ndarray:
-    """Return the squared residual ``[m]`` of each match, in the direction in which it is larger."""
+    """Return the squared residual ``[m]`` of each match, in the direction in which it is larger.
+
+    ``spread`` is the standard deviation of logarithms of depths.
+    """
     both = [(residuals.values**2).sum(1) for residuals in _two_way_residuals(similarities, matches, spread)]
     return np.asarray(np.maximum(*both))
 
 
 def _two_way_residuals(similarities: Similarities, matches: KeypointMatches, spread: float) -> list[_Residuals]:
-    """Compute the residuals of matches in both directions: from the first scene to the second, and back."""
+    """Compute the residuals of matches in both directions: from the first scene to the second, and back.
+
+    ``spread`` is the standard deviation of logarithms of depths.
+    """
     first, second = matches.sides
     forward = _similarity_between(similarities, matches.scenes)
     return [
@@ -213,7 +219,7 @@ def _measure_spreads(
 ) -> tuple[list[KeypointMatches], float]:
     """Measure the standard deviations of keypoints and of logarithms of depths, robustly.
 
-    Returns the matches with the first standard deviation, and the second one by itself.
+    Returns the matches with the standard deviation of keypoints, and the standard deviation of logarithms of depths.
     """
     errors = [_two_way_residuals(similarities, pair, DEPTH_SPREAD)[0].values for pair in matches]
     # residuals are in standard deviations; here they become pixels, and differences of logarithms of depths
@@ -233,8 +239,8 @@ def _measure_spreads(
 def _chain_largest_set(links: Sequence[tuple[Similarity, KeypointMatches]], count: int) -> Similarities:
     """Return the similarities of the largest connected set of scenes, into the frame of its first scene.
 
-    Scenes are placed one after the other, along the links with most matches. The result has None for all other scenes.
-    ``count`` is the number of all scenes.
+    Scenes are placed one after the other, along the links with most matches. The result has None for scenes outside the
+    largest set. ``count`` is the number of all scenes.
     """
     num_matches = [0] * count
     for _, pair in links:
@@ -249,7 +255,7 @@ def _chain_largest_set(links: Sequence[tuple[Similarity, KeypointMatches]], coun
     to_first = invert_similarity(first)
 
     def move(similarity: Similarity | None) -> Similarity | None:
-        """Return a similarity into the frame of the first scene instead."""
+        """Return a similarity that leads into the frame of the first scene instead of its own."""
         if similarity is None:
             return None
         return IDENTITY if similarity is first else compose(to_first, similarity)
@@ -265,7 +271,8 @@ def _count_placed(similarities: Similarities) -> int:
 def _chain_from_scene(start: int, links: Sequence[tuple[Similarity, KeypointMatches]], count: int) -> Similarities:
     """Place scenes in the frame of scene ``start``, each along the link with most matches to a scene already placed.
 
-    The result has None for scenes that are not connected with ``start``.
+    A link is two connected scenes, with their similarity and matches. The result has None for those of ``count`` scenes
+    that are not connected with ``start``.
     """
     similarities: list[Similarity | None] = [None] * count
     similarities[start] = IDENTITY
@@ -292,7 +299,8 @@ def _refine_similarities(
 ) -> Similarities:
     """Return the similarities with the least residuals of the matches, by damped Gauss-Newton steps.
 
-    The scene ``fixed`` (None: the first that is placed) does not move.
+    ``spread`` is the standard deviation of logarithms of depths. The scene ``fixed`` does not move; if ``fixed`` is
+    None, the first placed scene does not move.
     """
     placed = [i for i, each in enumerate(similarities) if each is not None]
     free = [i for i in placed if i != (placed[0] if fixed is None else fixed)]
@@ -325,7 +333,7 @@ def _make_similarity(step: np.ndarray) -> Similarity:
 def _normal_equations(
     similarities: Similarities, matches: Sequence[KeypointMatches], spread: float, free: Sequence[int]
 ) -> tuple[float, np.ndarray, np.ndarray]:
-    """Return Cauchy's cost of the residuals, and its curvature and slope for steps of the ``free`` scenes.
+    """Return Cauchy's cost of the residuals, and the cost's curvature and slope by steps of the ``free`` scenes.
 
     Each free scene has NUM_PARAMETERS rows, in the order of ``free``.
     """
@@ -342,7 +350,8 @@ def _normal_equations(
             squares = (residuals.values**2).sum(1)
             weights = 1 / (1 + squares / half_weight)
             cost += half_weight * float(log1p(squares / half_weight).sum())
-            # a step of the source scene moves points before the similarity; a step of the target, back and after it
+            # a step of the first scene moves points before the similarity; a step of the second scene moves points back
+            # after it
             source_jacobian = _differentiate_by_step(residuals.slopes, pair.sides[source].points, similarity)
             target_jacobian = -_differentiate_by_step(residuals.slopes, residuals.moved, IDENTITY)
             jacobians = {pair.scenes[source]: source_jacobian, pair.scenes[1 - source]: target_jacobian}
@@ -360,8 +369,8 @@ def _normal_equations(
 def _differentiate_by_step(slopes: np.ndarray, points: np.ndarray, similarity: Similarity) -> np.ndarray:
     """Return the derivatives ``[m,3,7]`` of residuals by the parameters of a step.
 
-    The step moves ``points [m,3]`` before ``similarity`` moves them. ``slopes [m,3,3]`` are the derivatives of the
-    residuals by the moved points.
+    The step moves ``points [m,3]`` before ``similarity`` moves the points. ``slopes [m,3,3]`` are the derivatives of
+    the residuals by the moved points.
     """
     by_point = similarity.scale * matmul(slopes, similarity.rotation)
     x, y, z = points.T
@@ -372,9 +381,9 @@ def _differentiate_by_step(slopes: np.ndarray, points: np.ndarray, similarity: S
 
 
 def _choose_shift_unit(photos: Sequence[Sequence[PhotoKeypoints]], similarities: Similarities) -> float:
-    """Return the unit in which shifts are rounded. It is the power of two above the first placed scene's median depth.
+    """Return the unit in which shifts are rounded, the power of two above the first placed scene's median depth.
 
-    Without keypoints in this scene the unit is 1.
+    If the first placed scene has no keypoints, the unit is 1.
     """
     first = next(scene_photos for scene_photos, each in zip(photos, similarities, strict=True) if each is not None)
     depths = np.concatenate([camera_depths(photo.points, photo.viewmat) for photo in first])

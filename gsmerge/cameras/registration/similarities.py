@@ -25,7 +25,7 @@ def fit_similarities(p: np.ndarray, q: np.ndarray, weights: np.ndarray) -> tuple
     m = matmul((share * b).swapaxes(1, 2), a)  # covariance of the two sets
     trace = np.trace(m, axis1=1, axis2=2)
     axis = np.stack([m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]], 1)
-    # the quaternion is the eigenvector of the largest eigenvalue of this form
+    # the quaternion is the eigenvector of the largest eigenvalue of the quadratic form ``form``
     form = np.empty((len(m), 4, 4))
     form[:, 0, 0] = trace
     form[:, 0, 1:] = axis
@@ -49,7 +49,7 @@ def compose(second: Similarity, first: Similarity) -> Similarity:
 
 
 def invert_similarity(similarity: Similarity) -> Similarity:
-    """Return the similarity that maps back."""
+    """Return the inverse of a similarity."""
     shift = -matmul(similarity.rotation.T, similarity.shift) / similarity.scale
     return Similarity(similarity.rotation.T, 1 / similarity.scale, shift)
 
