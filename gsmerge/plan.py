@@ -1,7 +1,7 @@
 """The plan of a run: the one place that reads "auto", effort, budget, recipe and checkpoint names.
 
 Every choice is a function here. :func:`make_plan` makes all choices for a prepared scene or block.
-:func:`choose_for_scene` makes those that need no computation. Estimates and scenes in blocks need only these. Each
+:func:`choose_for_scene` makes only the choices that need no computation, which estimates and scenes in blocks use. Each
 stage gets its own part of the plan, and no stage knows the options of another.
 """
 
@@ -134,7 +134,7 @@ class Plan:
     def weakens(self) -> bool:
         """Return whether a group starts with less opacity if other views see surfaces behind it.
 
-        This may leave holes, which a long fit closes.
+        The lower opacity may leave holes, which a long fit closes.
         """
         return self.superpixels.start_share < 1 and self.checkpoint is None
 
@@ -153,7 +153,7 @@ class Plan:
         return replace(self, fit=replace(self.fit, move_cameras=False))
 
     def with_fit(self, fit: FitOptions) -> Plan:
-        """Return the plan with another fit, which starts with all Gaussians."""
+        """Return the plan with the fit ``fit``, which starts with all Gaussians."""
         return replace(self, fit=fit, superpixels=replace(self.superpixels, start_share=1.0))
 
 
@@ -190,7 +190,7 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
 
 
 def _fill_options(prepared: Prepared, options: CompactOptions) -> FilledOptions:
-    """Fill in the settings that the options leave to the scene; notes say why they have their values."""
+    """Fill in the settings that the options leave to the scene; notes say why these settings have their values."""
     size, agreement = prepared.size, prepared.agreement
     filled = resolve_budget(size, options, agreement)
     segment = _resolve_superpixels(filled.segment, agreement, EFFORTS[options.effort])
@@ -255,7 +255,7 @@ def cuts_views(options: CompactOptions, size: SceneSize) -> bool:
 class SceneChoices:
     """Decisions about a whole scene that follow from its size and the options, without computation.
 
-    A run, its estimate and its blocks use the same ones.
+    A run, the estimate of the run and the blocks of the run use the same choices.
     """
 
     decode: DecodeOptions  # Gaussians per group
@@ -277,7 +277,7 @@ def choose_for_scene(
     """Make the decisions that follow from the scene's size and the options; UsageError for impossible options.
 
     ``num_input``: see :func:`gsmerge.facts.counts.count_limits`. ``keeps``: what :func:`keeps_fidelity` has returned
-    for the options of the caller; None: it is called for these ``options``.
+    for the options of the caller; None: what it returns for ``options``.
     """
     keeps = keeps_fidelity(scene, options) if keeps is None else keeps
     if scene.num_views == 0 and options.fit.fit_steps is None and not EFFORTS[options.effort].fits_alone:
@@ -294,8 +294,8 @@ def choose_for_scene(
     match = options.match.match or ("overlap" if EFFORTS[options.effort].merges else "none")
     networks = choose_networks(options, scene)
     # Views are cut into superpixels if they have pictures other than renders, or if a setting changes superpixels. A
-    # setting of their number does not count, because it only says how many Gaussians there are. Otherwise neighbouring
-    # Gaussians are merged pair by pair
+    # setting of the number of superpixels does not count, because it only says how many Gaussians there are. Without
+    # superpixels, neighbouring Gaussians are merged pair by pair
     cuts = scene.num_views > 0 and (not scene.rendered or options.changes_superpixels)
     may_merge_pairs = options.method == OURS and networks == "none" and not cuts
     return SceneChoices(decode, limits, match, networks, fit, keeps, may_merge_pairs)
@@ -338,11 +338,11 @@ def wanted_blocks(options: CompactOptions, num_gaussians: int, num_views: int = 
 def keeps_fidelity(scene: SceneSize, options: CompactOptions) -> bool:
     """Return whether the run searches for the fewest Gaussians that keep the quality of the input.
 
-    It does if the options do not decide the number, and the scene has no photos or few Gaussians per pixel. With few
-    Gaussians per pixel, no usual share of them is right: a scene that is compact already needs most of them, and a
-    scene of many small ones only a few. Without photos the PSNR of the result against the input has to be
-    ``FIDELITY_PSNR``. With photos the result may show them ``FIDELITY_LOSS`` worse than the input. Measurements are in
-    docs/internals/notebook.md.
+    The run searches if the options do not decide the number, and the scene has no photos or few Gaussians per pixel.
+    With few Gaussians per pixel, no usual share of the Gaussians is right: a scene that is compact already needs most
+    of its Gaussians, and a scene of many small Gaussians needs only a few. Without photos the PSNR of the result
+    against the input has to be ``FIDELITY_PSNR``. With photos the result may show them ``FIDELITY_LOSS`` worse than the
+    input. Measurements are in docs/internals/notebook.md.
     """
     # with half a Gaussian per pixel or more, the usual share of them is enough to show the photos
     is_dense = scene.has_own_pixels or scene.num_gaussians >= 0.5 * scene.num_views * scene.pixels_per_view > 0
@@ -416,8 +416,8 @@ def check_networks(checkpoint: Checkpoint, options: CompactOptions) -> None:
 def resolve_budget(size: SceneSize, options: CompactOptions, agreement: Agreement | None) -> CompactOptions:
     """Fill in the number of Gaussians beyond which new views gain nothing, with a note.
 
-    This number is larger the more the views confirm each other's depth. It is the budget if the options say "auto", and
-    an upper limit for a budget that is a share, a size or a device.
+    This number is larger the more the views confirm each other's depth. The number is the budget if the options say
+    "auto", and an upper limit for a budget that is a share, a size or a device.
     """
     budget = options.budget
     is_limit = budget.is_limit and options.method == OURS
@@ -493,8 +493,8 @@ def resolve_fit(options: CompactOptions) -> FitOptions:
 def steps_for(options: CompactOptions, num_views: int, share: float = USUAL_SHARE) -> int:
     """Return the number of steps of the full fit.
 
-    It follows from effort, number of views and ``share``, unless the options have it. ``share``: Gaussians of the
-    result for each pixel. A step draws one view. Measurements are in docs/internals/large-scenes.md.
+    The number follows from effort, number of views and ``share``, unless the options state the number. ``share``:
+    Gaussians of the result for each pixel. A step draws one view. Measurements are in docs/internals/large-scenes.md.
     """
     if options.fit.fit_steps is not None:
         return options.fit.fit_steps
@@ -507,8 +507,8 @@ def steps_for(options: CompactOptions, num_views: int, share: float = USUAL_SHAR
 def _fit_photos(prepared: Prepared, options: CompactOptions, fit: FitOptions) -> FitOptions:
     """Fill in the settings of the fit that depend on other options and on the scene.
 
-    They are the scale of the photos, and whether the fit moves cameras, fills the budget, and keeps Gaussians beyond
-    all views.
+    These settings are the scale of the photos, and whether the fit moves cameras, fills the budget, and keeps Gaussians
+    beyond all views.
     """
     scene = prepared.scene
     fit = replace(fit, beyond=options.prepare.extent == "beyond", fills=options.budget.is_filled)
@@ -537,8 +537,8 @@ def _fit_renders(prepared: Prepared, options: CompactOptions, fit: FitOptions) -
 def _choose_scored_views(prepared: Prepared, effort: Effort | None) -> tuple[int, ...]:
     """Choose the views that score input and result, among those whose pictures show the scene.
 
-    ``effort`` decides how many views the report needs. None: the views decide the number of Gaussians, which takes
-    more of them.
+    ``effort`` decides how many views the report needs. None: the views decide the number of Gaussians, which takes more
+    views than a report.
     """
     own = own_views(prepared)
     if prepared.reference.placed:
@@ -550,7 +550,7 @@ def _choose_scored_views(prepared: Prepared, effort: Effort | None) -> tuple[int
 def own_views(prepared: Prepared) -> tuple[int, ...]:
     """Return the views whose pictures show the scene: views that were placed, or views of the input.
 
-    The latter are numbered as in the input, where a view may be repeated.
+    Views of the input are numbered as in the input, where a view may be repeated.
     """
     if not prepared.reference.of_views:
         return prepared.reference.score_views

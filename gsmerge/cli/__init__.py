@@ -80,7 +80,8 @@ def program() -> NoReturn:
     if signal.getsignal(signal.SIGINT) == signal.default_int_handler:
         signal.signal(signal.SIGINT, stop_at_once)
     if os.name != "nt" and os.environ.get("TERM", "") in ("dumb", "unknown", "") and not os.environ.get("FORCE_COLOR"):
-        # Rich assumes that such a terminal has 80 by 25 letters, and that one without a name knows escape sequences
+        # Rich assumes that a dumb or unknown terminal has 80 by 25 letters, and that a terminal without a name knows
+        # escape sequences
         os.environ |= dict(zip(("COLUMNS", "LINES"), map(str, shutil.get_terminal_size()), strict=True), TERM="dumb")
     code = main()
     atexit._run_exitfuncs()

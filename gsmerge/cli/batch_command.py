@@ -164,7 +164,7 @@ def check_failures(failed: Sequence[tuple[str, str]], total: int, unit: str, *, 
 def _first_reason(reasons: Sequence[tuple[str, str]], *, listed: bool) -> str:
     """Return the end of a message: the first scene and its reason.
 
-    Empty if there is none, or if all reasons have been ``listed`` already.
+    The end is empty if there is no reason, or if all reasons have been ``listed`` already.
     """
     return "" if listed or not reasons else "; the first: {}: {}".format(*reasons[0])
 

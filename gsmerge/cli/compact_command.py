@@ -221,7 +221,7 @@ def _find_features(scenes: Sequence[Path]) -> FeatureFile | None:
 def _check_scenes(args: opt.Args) -> None:
     """Raise UsageError if several scenes cannot be joined.
 
-    They cannot if ``--cameras`` names one file for all, or if a scene is missing, given twice, or a result.
+    Scenes cannot be joined if ``--cameras`` names one file for all, or if a scene is missing, given twice, or a result.
     """
     if len(args.scenes) == 1:
         return

@@ -16,7 +16,7 @@ from gsmerge.errors import SceneError, UsageError, name_notes
     opt.READING,
 )  # fmt: skip
 def inspect(args: opt.Args) -> None:
-    """Check and describe files, and say what compact would make of each scene, or why it refuses it."""
+    """Check and describe files, and say what compact would make of each scene, or why compact refuses the scene."""
     from gsmerge.inspection.file_checks import holds_scene
     from gsmerge.io.formats.table import INDEX
 

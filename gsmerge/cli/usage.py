@@ -24,7 +24,8 @@ SYNONYMS = {
     **dict.fromkeys(("photos", "image-dir"), "images"),
     **dict.fromkeys(("poses", "colmap"), "cameras"),
 }
-# Typer does not export its usage errors; BadParameter, which it exports, derives from their common base
+# Typer does not export its usage errors; BadParameter, which Typer does export, derives from the common base of these
+# errors
 UsageErrors: Any = typer.BadParameter.__mro__[2]
 
 

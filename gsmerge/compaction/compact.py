@@ -69,7 +69,7 @@ def compact(
         scene: What :func:`gsmerge.read_scene` returns, or a path that it can read. A scene of tensors gives a result of
             tensors.
         options: Settings of all stages; None: the defaults.
-        progress: Called with (stage, done, stages); long stages also call it with ("fit: ...", step, steps).
+        progress: Called with (stage, done, stages); long stages also call ``progress`` with ("fit: ...", step, steps).
         **settings: Single settings by name that override ``options``: ``compact(scene, k=2, superpixels="1%")``.
 
     Raises:
@@ -113,8 +113,8 @@ def compact_scene(scene: Scene, options: CompactOptions) -> CompactResult:
 def _compact_simpler(scene: Scene, options: CompactOptions, result: CompactResult) -> CompactResult:
     """Compact a scene again with the changes of ``SIMPLER``, until a result is not clearly worse than its input.
 
-    ``result`` is the first result, which is clearly worse. A note says what was changed. Raises TargetError if all
-    results are clearly worse.
+    ``result`` is the first result, which is clearly worse than the input. A note says what was changed. Raises
+    TargetError if all results are clearly worse than the input.
     """
     cause = result.report.worse
     for words, change in SIMPLER:
@@ -189,7 +189,7 @@ def run_search(search: CountSearch, build: Build, prepared: Prepared) -> Candida
 def find_count(scene: Scene, options: CompactOptions) -> int:
     """Return the number of Gaussians that a run gives a scene without cameras, if a PSNR decides it.
 
-    It is found by the same search as in a run, for an estimate.
+    Estimates find the number by the same search as runs.
     """
     with use_threads(options.threads), record_part(silent=True):
         method = choose_method(options, scene)
@@ -225,8 +225,8 @@ def clean_best(candidate: Candidate, prepared: Prepared, plan: Plan) -> Candidat
 def build_cleaned(build: Build, prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
     """Build Gaussians and clean them up, so that ``count`` remain if the scene has that many.
 
-    A few more than ``count`` are built. If too few remain after clean-up, they are built once more, with as large a
-    surplus as clean-up dropped. If too many remain, the faintest are dropped.
+    A few more than ``count`` are built. If too few Gaussians remain after clean-up, all are built once more, with as
+    large a surplus as clean-up dropped. If too many Gaussians remain, the faintest are dropped.
     """
     if not plan.clean.asked:
         return build(prepared, plan, count)

@@ -82,7 +82,10 @@ class RunCosts:
         return [*parts, *self.end_parts(count, level_counts(count, self.settings["levels"], limits.min_count))]
 
     def build_part(self, count: float, steps: int | None = None) -> RunPart:
-        """Return the part that builds ``count`` Gaussians with a fit of ``steps``; None: as many steps as the run."""
+        """Return the part that builds ``count`` Gaussians with a fit of ``steps``.
+
+        None: as many steps as the fit of the run.
+        """
         settings, steps = self.settings, self.steps if steps is None else steps
         method = settings["method"]
         work = COST_PAIRS if self.merges_pairs else COST_BUILD
@@ -112,7 +115,7 @@ class RunCosts:
 def mean_inside(scene: Scene) -> float:
     """Return the share of a scene's Gaussians that lies in a view, as the mean of all views; 1 without views.
 
-    It is measured on a sample.
+    The share is measured on a sample of the Gaussians.
     """
     return float(np.mean(shares_inside(scene, INSIDE_GAUSSIANS) or [1.0]))
 

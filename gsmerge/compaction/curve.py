@@ -1,8 +1,8 @@
 """Measure the scene's curve, and choose a number of Gaussians by it.
 
-The curve is the quality of short fits by their number of Gaussians. It is measured on photos that the fits leave out
-or, with too few photos, on patches that they leave out. The number is at the knee of the curve, or the smallest that is
-good enough.
+The curve is the quality of short fits by their number of Gaussians. The quality is measured on photos that the fits
+leave out or, with too few photos, on patches that the fits leave out. The chosen number is at the knee of the curve, or
+the smallest that is good enough.
 """
 
 from __future__ import annotations
@@ -135,9 +135,9 @@ def count_reaching(points: Sequence[tuple[int, float]], target: float) -> int:
 def curve_knee(points: Sequence[CurvePoint]) -> int:
     """Return the count beyond which more Gaussians add little quality.
 
-    This knee is the last count at which the quality grows by at least 0.15 dB per doubling of the count. Halfway
-    between two neighbouring points, the slope of the curve is that of the line through them. Between these places the
-    slope is interpolated. The points are sorted by count.
+    The knee of the curve is the last count at which the quality grows by at least 0.15 dB per doubling of the count.
+    Halfway between two neighbouring points, the slope of the curve is that of the line through both points. Between two
+    such halfway places the slope is interpolated. The points are sorted by count.
     """
     doublings = [float(log(p.count) / log(2)) for p in points]
     pairs = list(pairwise(range(len(points))))

@@ -30,8 +30,8 @@ class Method:
 
     Args:
         name: The name on the command line.
-        run: A function of a prepared scene, a plan and a number of Gaussians. It returns at most so many canonical
-            Gaussians, unless the method keeps those of the input. Its parts are blocks of
+        run: A function of a prepared scene, a plan and a number of Gaussians. The function returns at most this number
+            of canonical Gaussians, unless the method keeps the Gaussians of the input. Its parts are blocks of
             :func:`gsmerge.runtime.record.stage`, which measures their time.
         needs_photos: The scene must have photos.
         uses: Flat names of the settings that it uses, in addition to those that all methods use.
@@ -74,7 +74,7 @@ def find_method(options: CompactOptions) -> Method:
 
 
 def is_without_views(scene: Scene, options: CompactOptions) -> bool:
-    """Return whether a run works without views: the scene has none, and no option asks for a stage that needs them.
+    """Return whether a run works without views: the scene has none, and no option asks for a stage that needs views.
 
     Gaussians are then merged with their neighbours, by positions and colours alone.
     """

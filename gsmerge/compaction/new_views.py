@@ -27,20 +27,22 @@ from gsmerge.settings.stages import SHARE
 from gsmerge.types import Cameras, PicturedScene, Pixels
 
 TRIAL_PIXELS = 120  # the longer side of the small pictures has at least this many pixels
-# Most steps of the fit. With fewer than 150 steps, fits of few views have other settings
+# Most steps of the fit. With fewer than 150 steps, fits of few views have other settings than longer fits have
 # (gsmerge.fit.schedule.MANY_STEPS), and predict less
 TRIAL_STEPS = 200
-# Most views of a round: those nearest to the left-out ones. Farther views show little of what these show. With more
-# views, TRIAL_STEPS would also draw each view too seldom to tell how a run with more steps ends
+# Most views of a round: those nearest to the left-out views. Farther views show little of what the left-out views show.
+# With more than TRIAL_VIEWS views, TRIAL_STEPS would also draw each view too seldom to tell how a run with more steps
+# ends
 TRIAL_VIEWS = 64
 # Small pictures have more detail in each pixel, so they lose more with few Gaussians. The trial therefore has more
-# Gaussians per pixel than the result. If the result has x times the usual share, the trial has x to the power of
-# SHARE_POWER times this share. On five captures at 1 % this lowers the error of the estimated gain from 2.3 to 1.0 dB
+# Gaussians per pixel than the result. If the result has x times the usual number of Gaussians per pixel, the trial has
+# x to the power of SHARE_POWER times the usual number. On five captures at 1 % this lowers the error of the estimated
+# gain from 2.3 to 1.0 dB
 USUAL_DENSITY, SHARE_POWER = parse_share(SHARE), 0.3
-# The expected gain of new views is a weighted mean of two gains: that of the result's own photos, as far as depth is
-# confirmed, with the weight OWN_WEIGHT, and that of left-out photos in the trial. The true gain lies between the two,
-# or at most SPREAD dB outside, for 80 % of the results or more, on ten captures and on five others
-# (docs/internals/notebook.md). Nothing is known about results with more than MOST_SHARE Gaussians for each pixel
+# The expected gain of new views is a weighted mean of two gains: the gain of the result's own photos, as far as depth
+# is confirmed, with the weight OWN_WEIGHT, and the gain of left-out photos in the trial. The true gain lies between
+# these two gains, or at most SPREAD dB outside of them, for 80 % of the results or more, on ten captures and on five
+# others (docs/internals/notebook.md). Nothing is known about results with more than MOST_SHARE Gaussians for each pixel
 OWN_WEIGHT, SPREAD, MOST_SHARE = 0.2, 1.25, 0.1
 
 
@@ -118,9 +120,9 @@ def try_new_views(prepared: Prepared, plan: Plan, build: Build, count: int) -> T
 def _score_round(prepared: Prepared, views: Sequence[int], plan: Plan, build: Build, share: float) -> np.ndarray | None:
     """Leave out ``views``, compact other views near them at a small size, and score the result on the left-out photos.
 
-    ``share`` is the number of Gaussians per pixel. Returns an array ``[4,v]``. Its rows are the share of each photo
-    that the other views see, and the PSNR (dB) of renders from all Gaussians, from those of the other views, and from
-    the result. None if no other view sees what the photos show.
+    ``share`` is the number of Gaussians per pixel. Returns an array ``[4,v]``, whose rows are the share of each photo
+    that the other views see, and the PSNR (dB) of renders from all Gaussians, from the Gaussians of the other views,
+    and from the result. None if no other view sees what the photos show.
     """
     used_views = views_around(prepared.scene.cameras, views, TRIAL_VIEWS)
     scene = prepared.scene if len(used_views) == len(prepared.scene) else subset(prepared.scene, used_views)

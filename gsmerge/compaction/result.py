@@ -43,8 +43,8 @@ class CompactResult:
     Args:
         gaussians: The Gaussians.
         report: The report of the run.
-        cameras: The given views in the same frame. Wrong poses have been corrected, see ``poses`` of
-            :class:`gsmerge.settings.stages.PrepareOptions`.
+        cameras: The cameras of the input's views, in the frame of the Gaussians. Wrong poses have been corrected, see
+            ``poses`` of :class:`gsmerge.settings.stages.PrepareOptions`.
         coarser: Coarser levels of detail; each has a quarter of the Gaussians of the level before.
         names: Names of the views.
         scene: The path of the scene that was given, or a weak reference to it, which does not keep it in memory.
@@ -99,8 +99,8 @@ class CompactResult:
     def show(self, scene: Scene | StrPath | None = None) -> Page:
         """Show the scene and the result as :func:`gsmerge.view` does, in a notebook at the end of a cell.
 
-        ``scene``: the input. It only has to be given if it is no longer in memory; without an input the result is shown
-        alone.
+        ``scene``: the input, which only has to be given if it is no longer in memory; without an input the result is
+        shown alone.
         """
         from gsmerge.pages.view import view
 

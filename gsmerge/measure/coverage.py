@@ -13,8 +13,9 @@ from gsmerge.types import Gaussians, Scene
 
 
 def extents(gaussians: Gaussians) -> dict[str, Any]:
-    """Measure positions and sizes of Gaussians with finite values, in world units; on a sample if there are many.
+    """Measure positions and sizes of Gaussians with finite values, in world units.
 
+    Many Gaussians are measured on a sample.
     Returns:
         ``box_low`` and ``box_high``: percentiles 1 and 99 of the positions, for each axis. ``diagonal``: length of this
         box's diagonal. ``share_outliers``: share of positions outside the box enlarged ten times. ``share_floaters``:

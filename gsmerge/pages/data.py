@@ -87,8 +87,9 @@ class ViewData:
     def start(self) -> int:
         """Index of the view with which the page opens.
 
-        It is the view with the median score, or the first one if no view has scores. Only held-out views are considered
-        if there are any, and of these only views with LPIPS if there are any.
+        The page opens with the view of the median score, or with the first view if no view has scores. If there are
+        held-out views, only these are considered. If some of the considered views have LPIPS, only views with LPIPS are
+        considered.
         """
         views = list(enumerate(self.views))
         held_out = [(i, view) for i, view in views if view.held_out] or views
@@ -308,7 +309,7 @@ def _choose_shown(views: Sequence[PageView]) -> tuple[PageView, ...]:
     """Choose ``MAX_SHOWN_VIEWS`` views and the worst view; return them worst first."""
 
     def quality(view: PageView) -> float:
-        """Return a view's PSNR of the first result, or of the scene if it is alone; infinity if it was not measured."""
+        """Return a view's PSNR of the first result, or of a scene without results; infinity if there is no PSNR."""
         psnr = view.scores[min(1, len(view.scores) - 1)].psnr
         return np.inf if psnr is None else psnr
 

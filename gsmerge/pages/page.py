@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 # Content security policy: a page may run only its own scripts and styles, which the policy names by their hashes
 PICTURES_POLICY = "default-src 'none'; img-src data:; style-src {style}; script-src {script}"
-# The 3D viewer Spark needs WebAssembly and a worker. Its script holds both, as data: and blob: addresses
+# The 3D viewer Spark needs WebAssembly and a worker. The viewer's script holds both as data: and blob: addresses
 SOLID_POLICY = f"{PICTURES_POLICY} blob: 'wasm-unsafe-eval'; worker-src data: blob:; connect-src data: blob:"
 POLICY_MARK = "{policy}"  # placeholder in the templates until the hashes are known
 VIEWER = Path(__file__).parent / "vendor/spark-three.js.gz"
@@ -155,7 +155,10 @@ def speed(data: ViewData, side_id: int = 1) -> float | None:
 
 
 def speed_words(ratio: float | None) -> str:
-    """Return the end of the headline, which says how much faster a result is drawn; "" if it is not clearly faster."""
+    """Return the end of the headline, which says how much faster a result is drawn.
+
+    "" if the result is not clearly faster.
+    """
     min_ratio = 1.2  # the headline mentions a ratio of drawing times from this value on
     if ratio is None or ratio < min_ratio:
         return ""
@@ -300,8 +303,8 @@ def base64_text(content: bytes) -> str:
 def render_template(name: str, policy: str, **values: Any) -> str:
     """Fill a template with values, which are escaped unless the template says otherwise.
 
-    ``policy`` is the page's content security policy. Its ``{script}`` and ``{style}`` become the hashes of the page's
-    scripts and styles.
+    ``policy`` is the page's content security policy. The policy's ``{script}`` and ``{style}`` become the hashes of the
+    page's scripts and styles.
     """
     text = _environment().get_template(name).render(version=__version__, **values)
     text = text.encode("utf-8", "replace").decode("utf-8")  # names of files may have lone surrogates

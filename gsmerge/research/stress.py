@@ -1,7 +1,7 @@
 """Compact a scene under bad conditions: with worse views, poses, photos or rows.
 
 A case defines how a scene is changed, which scenes it applies to, and the property that must hold. A change returns a
-new scene. If it moves the world, it also moves the held-out views.
+new scene. A change that moves the world also moves the held-out views.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def keep_views(setup: StressScene, choose: Callable[[int], Sequence[int]]) -> St
 def scale_and_shift(setup: StressScene, factor: float, shift: Sequence[float]) -> StressScene:
     """Scale the world by ``factor``, then shift it by ``shift`` times the size that the scene has after scaling."""
     scene, views = setup.scene, setup.views
-    # The scene is moved from this frame to the world
+    # ``frame`` is the frame in which the scene stands before it is moved to the world
     frame = Frame(np.array(shift, np.float64) * scene_frame(scene).unit * factor, factor)
     scene = replace(scene, gaussians=frame.leave(scene.gaussians), cameras=frame.leave_cameras(scene.cameras))
     return StressScene(scene, views and replace(views, cameras=frame.leave_cameras(views.cameras)))
@@ -168,8 +168,9 @@ def stress(
 ) -> tuple[StressOutcome, ...]:
     """Compact a scene under bad conditions, all ``CASES`` or the named ones, and check each result.
 
-    Results are scored on the held-out views ``targets`` if there are any. Otherwise they are scored on the photos of
-    the input views, or on renders of the input if it has no photos. ``progress`` is called with (case, done, total).
+    Results are scored on the held-out views ``targets`` if there are any. Without ``targets``, results are scored on
+    the photos of the input views, or on renders of the input if it has no photos. ``progress`` is called with (case,
+    done, total).
 
     Raises:
         UsageError: If a case is unknown, or the scene has no views.
@@ -265,7 +266,7 @@ def _check_result(case: Case, base: _ScoredResult, result: _ScoredResult, slack:
 def _check_again(setup: StressScene, base: _ScoredResult, options: CompactOptions) -> tuple[bool, str]:
     """Compact the result ``base`` a second time without reducing it, and check that the quality stays.
 
-    Returns True if it stays, and the PSNR after and before.
+    Returns True if the quality stays, and the PSNR after and before the second run.
     """
     scene = setup.scene
     unaligned = Scene(base.gaussians, scene.cameras, scene.images, None, scene.names)

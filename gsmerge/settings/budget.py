@@ -86,7 +86,7 @@ class BudgetOptions(Settings):
 
     @property
     def number(self) -> int | None:
-        """The number of Gaussians if the budget is a number; None for any other budget, or without one."""
+        """The number of Gaussians if the budget is a number; None for any other budget, or without a budget."""
         if self.budget is None or self.auto or self.in_bytes or self.budget in DEVICES or "%" in str(self.budget):
             return None
         return parse_budget(self.budget, sys.maxsize)

@@ -1,7 +1,7 @@
 """Render photos and exact depth of a room.
 
-A ray of each sample finds the first surface. Its colour comes from the surface's texture, and from lights with shadow
-maps. A tone curve like that of film turns the light into the colours of a photo.
+A ray of each sample finds the first surface. The sample's colour comes from the surface's texture, and from lights with
+shadow maps. A tone curve like that of film turns the light into the colours of a photo.
 """
 
 from __future__ import annotations

@@ -206,7 +206,7 @@ def _plan_session(rng: np.random.Generator, options: GenerateOptions) -> _PhotoS
 
 
 def _shrink_lens(lens: Pinhole) -> Pinhole:
-    """Return a smaller camera for previews. They show if views are usable, and how bright they are."""
+    """Return a smaller camera for previews, which show if views are usable, and how bright views are."""
     divisor = 8  # the sides of previews are those of views divided by this
     return Pinhole(max(8, lens.width // divisor), max(8, lens.height // divisor), lens.focal / divisor)
 
@@ -244,8 +244,8 @@ def _take_photo(lit: LitRoom, pose: Array, lens: Pinhole, noise: Noise, gain: fl
 def _perturb_pose(pose: Array, noise: Noise, depth: float, deviation: Array) -> Array:
     """Add the network's error to a pose, for a median ``depth``.
 
-    ``deviation [2,3]`` has standard normal numbers for rotation and position. They are multiplied by the sizes of the
-    errors, ``noise.turn`` and ``noise.shift``.
+    ``deviation [2,3]`` has standard normal numbers for rotation and position. These numbers are multiplied by the sizes
+    of the errors, ``noise.turn`` and ``noise.shift``.
     """
     rotation = np.deg2rad(noise.turn) * deviation[0] / 3**0.5
     angle = np.sqrt((rotation * rotation).sum())

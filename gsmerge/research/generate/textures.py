@@ -30,8 +30,9 @@ def enlarge_texture(cells: NDArray[np.float64], size: int) -> Grey:
 def draw_octaves(
     rng: np.random.Generator, size: int, *, first: int = 4, fade: float = 0.6, stretch: int = 1, ridged: bool = False
 ) -> Grey:
-    """Draw noise as a sum of octaves. Each octave has half the cell size and ``fade`` times the strength of the last.
+    """Draw noise as a sum of octaves.
 
+    Each octave has half the cell size and ``fade`` times the strength of the octave before.
     A ``fade`` of 0.3 gives clouds, and one of 0.9 gives grit. ``first`` is the number of cells of the coarsest octave
     along a side. ``stretch`` is the ratio of a cell's length to its height. Noise that is ``ridged`` has sharp crests,
     as in rock and bark.

@@ -149,7 +149,7 @@ def select_example_views(example: Example, ids: Sequence[int]) -> Example:
 def draw_random_views(example: Example, options: TrainOptions, rng: np.random.Generator) -> Example:
     """Restrict an example to random views, as many as ``options.random_views`` allows (paper supplement C).
 
-    Without this option the example keeps its views.
+    If ``options.random_views`` is not set, the example keeps its views.
     """
     if not options.random_views:
         return example

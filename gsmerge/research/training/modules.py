@@ -1,10 +1,10 @@
 """Encoder, decoder heads, merger and refiner as torch modules, for training (paper sections 4.2 to 4.5).
 
-All of them take tokens, and return raw corrections of what the closed formulas of the stages compute (fig.
+All networks take tokens, and return raw corrections of what the closed formulas of the stages compute (fig.
 architecture). The last layers start at zero, so untrained networks change nothing.
 
-They are built from the blocks of the Set Transformer (Lee et al. 2019). Sets are padded to one size. ``mask`` is True
-for tokens of the set and False for padding, which gets no attention.
+All networks are built from the blocks of the Set Transformer (Lee et al. 2019). Sets are padded to one size. ``mask``
+is True for tokens of the set and False for padding, which gets no attention.
 """
 
 from __future__ import annotations
@@ -45,7 +45,11 @@ def zero_init(layer: nn.Linear) -> nn.Linear:
 
 
 def small_init(layer: nn.Linear) -> nn.Linear:
-    """Make a layer's initial weights small. With zeros, the children of a group would be equal and stay equal."""
+    """Make a layer's initial weights small.
+
+    With weights of 0, the children of a group would be equal, would get equal gradients, and would therefore stay
+    equal.
+    """
     with torch.no_grad():
         for values in layer.parameters():
             values.mul_(0.1)
