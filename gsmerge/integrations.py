@@ -195,7 +195,7 @@ def _convert_gaussians(gaussians: Any, sh_degree: int) -> dict[str, Array]:
 def _convert_views(
     poses: Mapping[str, Array], extrinsics: str, intrinsics: str, images: Array
 ) -> dict[str, np.ndarray]:
-    """Return the arguments for the views of pixelSplat and its successors.
+    """Return the arguments for the views of pixelSplat and its successors, from entries of ``poses`` by name.
 
     The poses of these models are camera to world, the intrinsics are relative to the image's size, and the images have
     the channels first.

@@ -64,7 +64,7 @@ def merge_views(prepared: Prepared, plan: Plan, count: int | None) -> MergedView
 def encode_views(
     prepared: Prepared, plan: Plan, count: int | None
 ) -> tuple[FeatureGaussians, Members, Segmentation, Corrector]:
-    """Encode each superpixel of all views as a Feature Gaussian; return also its members and the networks in use.
+    """Encode each superpixel of all views as a Feature Gaussian; also return members, superpixels and networks.
 
     A run merges the Feature Gaussians; :mod:`gsmerge.states` keeps them in a file to which views can be added.
     """

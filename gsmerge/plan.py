@@ -341,8 +341,8 @@ def keeps_fidelity(scene: SceneSize, options: CompactOptions) -> bool:
     The run searches if the options do not decide the number, and the scene has no photos or few Gaussians per pixel.
     With few Gaussians per pixel, no usual share of the Gaussians is right: a scene that is compact already needs most
     of its Gaussians, and a scene of many small Gaussians needs only a few. Without photos the PSNR of the result
-    against the input has to be ``FIDELITY_PSNR``. With photos the result may show them ``FIDELITY_LOSS`` worse than the
-    input. Measurements are in docs/internals/notebook.md.
+    against the input has to be ``FIDELITY_PSNR``. With photos the result may show the photos ``FIDELITY_LOSS`` worse
+    than the input. Measurements are in docs/internals/notebook.md.
     """
     # with half a Gaussian per pixel or more, the usual share of them is enough to show the photos
     is_dense = scene.has_own_pixels or scene.num_gaussians >= 0.5 * scene.num_views * scene.pixels_per_view > 0

@@ -315,10 +315,7 @@ class Pixels(ArrayFields):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Region(ArrayFields):
-    """A box, which may be rotated, or a sphere.
-
-    A region is convex, so the mean of points inside them is also inside.
-    """
+    """A box, which may be rotated, or a sphere. Regions are convex: the mean of points inside is also inside."""
 
     middle: np.ndarray  # [3]
     half: np.ndarray  # [3] half of each side of a box; three times the same radius for a sphere
@@ -427,8 +424,7 @@ class Scene(ArrayFields):
     def covered(self) -> np.ndarray | None:
         """Mask ``[v,h,w]`` of the pixels for which the file has a Gaussian.
 
-        None if the file has a Gaussian for every pixel.
-        None also if views have no Gaussians of their own.
+        None if the file has a Gaussian for every pixel, or if views have no Gaussians of their own.
         """
         if self.pixels is None or not self.pixels.own or (self.filled is None and self.pixels.shown.all()):
             return None

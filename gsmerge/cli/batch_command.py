@@ -153,7 +153,7 @@ def _run_jobs(args: opt.Args, jobs: Sequence[Job], options: BatchOptions, totals
 
 
 def check_failures(failed: Sequence[tuple[str, str]], total: int, unit: str, *, listed: bool = False) -> None:
-    """Raise BatchError if jobs ``failed`` (name, reason).
+    """Raise BatchError if jobs ``failed`` (name, reason), of ``total`` jobs that messages count as ``unit``.
 
     The message has the first reason, unless all reasons have been ``listed`` already.
     """

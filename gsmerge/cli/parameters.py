@@ -161,7 +161,7 @@ class Args(SimpleNamespace):
 
 
 def parse_pairs(flag: str, pairs: Iterable[str], settings: Mapping[str, Setting]) -> dict[str, Any]:
-    """Parse NAME=VALUE pairs of ``--set`` or ``--hint``; UsageError if one is wrong."""
+    """Parse NAME=VALUE pairs of ``--set`` or ``--hint``; UsageError if one is wrong, with ``flag`` in its message."""
     values: dict[str, Any] = {}
     for pair in pairs:
         name, sign, text = pair.partition("=")
@@ -444,7 +444,7 @@ _TABLE = (
     panel(
         COUNT_GROUP,
         setting_option("k", metavar="1-8|mixed|auto"),
-        # The budget is kept as a text, because reports and the records of batches store a text
+        # The budget is kept as a text, because reports and the records of batches store texts
         setting_option("budget", metavar="40000|2%|5MB|DEVICE|auto", parser=str),
         setting_option("quality", metavar="30dB|-0.2dB"),
         setting_option("levels", wording="1, or 3 in a lod-meta.json"),

@@ -82,7 +82,7 @@ def _check_output(output: Path, inputs: set[str], *, overwrite: bool, reports: b
 
 
 def _check_writable(folder: Path, output: Path, expected: str) -> None:
-    """Raise SceneError if a folder, or the nearest existing folder above it, cannot be written to."""
+    """Raise SceneError for ``output`` if a folder, or the nearest existing folder above it, cannot be written to."""
     try:
         nearest = next(path for path in (folder, *folder.absolute().parents) if os.path.lexists(path))
     except OSError as error:

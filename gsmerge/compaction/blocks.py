@@ -165,7 +165,7 @@ def adopt_records(outcomes: Iterable[tuple[T, Record]]) -> Iterator[tuple[T, dic
 def list_calls(starts: Sequence[BlockStart], *values: Any) -> Iterator[tuple[Any, ...]]:
     """Yield the arguments of a call for each block: its start, the ``values``, and its number.
 
-    The caller sends the arguments of one block before it asks for the next, so that the memory of the sent ones is
+    The caller sends the arguments of one block before it asks for the next, so that the memory of the sent arguments is
     released.
     """
     for number, start in enumerate(starts):

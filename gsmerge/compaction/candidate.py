@@ -80,8 +80,8 @@ def _measure_fidelity(gaussians: Gaussians, prepared: Prepared, plan: Plan) -> f
 def with_moved_views(prepared: Prepared, cameras: Cameras) -> Prepared:
     """Return a prepared scene whose views have the canonical ``cameras`` of a fit.
 
-    The views of the input, which are in the world, move along. If the fit moved no camera, the views of the input keep
-    the same object of cameras.
+    The views of the input, which are in the world, move along. If the fit moved no camera, the input's cameras stay the
+    same object.
     """
     prepared = prepared.with_cameras(cameras)
     input_cameras = prepared.final_cameras()

@@ -31,8 +31,8 @@ class Method:
     Args:
         name: The name on the command line.
         run: A function of a prepared scene, a plan and a number of Gaussians. The function returns at most this number
-            of canonical Gaussians, unless the method keeps the Gaussians of the input. Its parts are blocks of
-            :func:`gsmerge.runtime.record.stage`, which measures their time.
+            of canonical Gaussians, unless the method keeps the Gaussians of the input. The function's parts are blocks
+            of :func:`gsmerge.runtime.record.stage`, which measures their time.
         needs_photos: The scene must have photos.
         uses: Flat names of the settings that it uses, in addition to those that all methods use.
         check: Raises a UsageError if a program that the method runs is missing.

@@ -27,7 +27,7 @@ from gsmerge.settings.stages import SHARE
 from gsmerge.types import Cameras, PicturedScene, Pixels
 
 TRIAL_PIXELS = 120  # the longer side of the small pictures has at least this many pixels
-# Most steps of the fit. With fewer than 150 steps, fits of few views have other settings than longer fits have
+# Most steps of the fit. With fewer than 150 steps, fits of few views have other settings than longer fits
 # (gsmerge.fit.schedule.MANY_STEPS), and predict less
 TRIAL_STEPS = 200
 # Most views of a round: those nearest to the left-out views. Farther views show little of what the left-out views show.
@@ -36,8 +36,8 @@ TRIAL_STEPS = 200
 TRIAL_VIEWS = 64
 # Small pictures have more detail in each pixel, so they lose more with few Gaussians. The trial therefore has more
 # Gaussians per pixel than the result. If the result has x times the usual number of Gaussians per pixel, the trial has
-# x to the power of SHARE_POWER times the usual number. On five captures at 1 % this lowers the error of the estimated
-# gain from 2.3 to 1.0 dB
+# x to the power of SHARE_POWER times the usual number. On five captures at 1 % the larger number lowers the error of
+# the estimated gain from 2.3 to 1.0 dB
 USUAL_DENSITY, SHARE_POWER = parse_share(SHARE), 0.3
 # The expected gain of new views is a weighted mean of two gains: the gain of the result's own photos, as far as depth
 # is confirmed, with the weight OWN_WEIGHT, and the gain of left-out photos in the trial. The true gain lies between

@@ -70,7 +70,7 @@ def fit_seams(joined: Gaussians, owners: np.ndarray, starts: Sequence[BlockStart
 def find_seams(
     joined: Gaussians, owners: np.ndarray, starts: Sequence[BlockStart]
 ) -> tuple[np.ndarray, list[list[int]]]:
-    """Return a mask ``[n]`` of Gaussians at seams and, for each block, the block's own views that show many of these.
+    """Return a mask ``[n]`` of Gaussians at seams and, for each block, the block's own views that show many of them.
 
     A Gaussian is at a seam if views of other blocks show it, too.
     """

@@ -116,8 +116,8 @@ class CountSearch:
     def count(self) -> int | None:
         """The number of Gaussians that the search has chosen: that of the best candidate.
 
-        With left-out photos it is the number at which these photos reach the target, which may lie between the counts
-        of two candidates.
+        With left-out photos the number is the one at which these photos reach the target, which may lie between the
+        counts of two candidates.
         """
         if self.plan.target_psnr is None or self.left_out is None:
             return self.best.count

@@ -161,7 +161,7 @@ def _combine(
 
 
 def _to_numpy(name: str, values: Any) -> np.ndarray:
-    """Return an array or tensor as a NumPy array; SceneError if ``values`` are no numbers."""
+    """Return the argument ``name``, an array or tensor, as a NumPy array; SceneError if ``values`` holds no numbers."""
     check_numbers(name, values)
     return as_array(values)
 
@@ -294,8 +294,9 @@ def _check_cameras_and_images(
 
 
 def _to_matrices(name: str, values: Any, shapes: Sequence[tuple[int, int]], views: int) -> np.ndarray:
-    """Return a float64 matrix for each view; SceneError if number or shape of the matrices is wrong.
+    """Return a float64 matrix of the argument ``name`` for each view.
 
+    SceneError if number or shape of the matrices is wrong.
     ``views`` is the number of views, and ``shapes`` are the shapes that a matrix may have.
     """
     array = _to_numpy(name, values).astype(np.float64, order="C")
@@ -376,6 +377,6 @@ def _check_seen(gaussians: Gaussians, valid: np.ndarray, cameras: Cameras, image
 
 
 def _convention_error(convention: Convention, description: str, fact: str) -> SceneError:
-    """Return the error for view matrices of another convention, with a remedy."""
+    """Return the error for view matrices of another convention, with its ``description``, a ``fact`` and a remedy."""
     problem = f"expected world-to-camera matrices with OpenCV axes, found that {fact} when the matrices are read as"
     return SceneError("viewmats", f"{problem} {description}", _REMEDIES[convention])

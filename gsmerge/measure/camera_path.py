@@ -196,7 +196,7 @@ def _pose_rows(cameras: Cameras, depth: float) -> tuple[np.ndarray, np.ndarray]:
 def _curve(rows: np.ndarray, knots: np.ndarray, times: np.ndarray, depth: float) -> np.ndarray:
     """Evaluate a spline that passes the poses ``rows [c,7]`` at the times ``knots [c]``.
 
-    Returns its poses ``[m,7]`` at ``times [m]``.
+    Returns its poses ``[m,7]`` at ``times [m]``, as rows of :func:`_pose_rows` for ``depth``.
     """
     steps = np.diff(knots)[:, None]
     slopes = np.diff(rows, axis=0) / steps

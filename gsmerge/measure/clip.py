@@ -132,7 +132,7 @@ def draw_swipe(pictures: Sequence[BytePicture], borders: Sequence[int], captions
 
 
 class FfmpegWriter:
-    """Writer of frames with the program ffmpeg, which has the methods of :class:`cv2.VideoWriter`."""
+    """Writer of frames with the program ffmpeg, with the methods of :class:`cv2.VideoWriter`."""
 
     def __init__(self, program: str, path: Path, shape: tuple[int, ...], fps: float) -> None:
         """Start the ``program``, which writes frames of ``shape [h,w,c]`` to a file."""

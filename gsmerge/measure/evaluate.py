@@ -172,7 +172,7 @@ class _Split:
 
 @dataclass(frozen=True, eq=False)
 class _Renderer:
-    """Renderer of views, which has the same settings for all scenes, so that equal Gaussians give equal images."""
+    """Renderer of views, with the same settings for all scenes, so that equal Gaussians give equal images."""
 
     near: float  # near plane, world units
     options: EvaluateOptions
@@ -298,7 +298,7 @@ def _describe_scores(splits: Mapping[str, _Split], scores: Sequence[ResultScores
     """Yield notes on results that are clearly worse than the input, and on figures that may mislead.
 
     ``mended`` is True if compact changes the photos before it fits a scene to them. Scores use the unchanged photos, so
-    a result of changed photos may differ from the unchanged photos for a good reason.
+    a result that was fitted to changed photos may differ from the unchanged photos for a good reason.
     """
     photos = "context" in splits and splits["context"].reference == PHOTOS
     psnrs = {score.name: score.mean("context")[0].psnr for score in scores}
@@ -362,8 +362,8 @@ def _score_split(
 ) -> dict[str, list[tuple[float, ViewScore]]]:
     """Draw and score all results, one view after the other.
 
-    Returns, for each result, the seconds of drawing and the score of each view. ``cameras`` has the cameras of the
-    results that were made with other poses than the scene has.
+    Returns, by the name of each result, the seconds of drawing and the score of each view. ``kind`` is the name of the
+    split. ``cameras`` has the cameras of the results that were made with other poses than the scene has.
     """
     options, names = renderer.options, split.views.names
     lpips_views = pick_views(len(names), options.lpips_views or len(names))

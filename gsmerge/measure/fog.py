@@ -1,9 +1,9 @@
 """Measure fog, veils, holes and spikes: errors of a compact scene that only show from outside the views.
 
 Photos score a scene from their own viewpoints only, but a person who views the scene first steps back and turns. From
-outside, Gaussians in gaps between the views show as haze, and Gaussians of wrong depth as veils before surfaces. Gaps
-in surfaces show as holes. Long thin Gaussians, which look like texture in one view, show as strokes. Photos are not
-needed, only the input and the cameras of its views. docs/guide/evaluate.md explains the figures to users.
+outside, Gaussians in gaps between the views show as haze, and Gaussians of wrong depth show as veils before surfaces.
+Gaps in surfaces show as holes. Long thin Gaussians, which look like texture in one view, show as strokes. Photos are
+not needed, only the input and the cameras of its views. docs/guide/evaluate.md explains the figures to users.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from gsmerge.runtime.record import Progress
 from gsmerge.types import Cameras, Gaussians
 
 VIEWS = 3  # evenly spread input views from which the cameras start
-# Cameras by kind, as pairs of a share and an angle. A camera steps back from an input view, by this share of the view's
-# median depth. Then the camera turns about the point in the view's middle, by this angle in degrees
+# Outside cameras by kind, as pairs of a share and an angle. A camera steps back from an input view, by this share of
+# the view's median depth. Then the camera turns about the point in the view's middle, by this angle in degrees
 FOG_CAMERAS = {"back": ((0.5, 0), (1.5, 0)), "turned": ((0.5, -30), (0.5, 30))}
 ALL = "all"  # kind that stands for all of these cameras
 FOG_PIXELS = 480  # longer side of the pictures is at most this, pixels

@@ -92,7 +92,7 @@ def lpips(image: Array, reference: Array, net: str = "vgg", mask: Array | None =
     The images are ``[h,w,3]`` sRGB in [0, 1], arrays or tensors, with at least 16 x 16 pixels for ``"vgg"`` (VGG-16)
     and 31 x 31 for ``"alex"`` (AlexNet). Distances of the two networks cannot be compared. Pixels outside
     ``mask [h,w]`` are copied from ``reference`` before the networks see them, so they do not differ. The mean is taken
-    over the whole image, with these pixels.
+    over the whole image, with the copied pixels.
 
     Raises:
         GsmergeError: If the package with the weights is not installed.

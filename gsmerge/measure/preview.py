@@ -56,7 +56,7 @@ def label(picture: BytePicture, text: str) -> BytePicture:
 
 
 def shorten_text(text: str, width: int, scale: float, thickness: int) -> str:
-    """Shorten a text that OpenCV would draw wider than ``width`` pixels.
+    """Shorten a text that OpenCV would draw, with ``scale`` and ``thickness``, wider than ``width`` pixels.
 
     Parts of the text, which commas separate, are left out from the last on. If the first part alone is too wide, dots
     replace its middle.

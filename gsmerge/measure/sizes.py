@@ -67,7 +67,7 @@ def shrink_views(views: SomeViews, side: int) -> SomeViews:
 
 
 def resize_photo(photo: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Resize a photo ``[h,w,3]``: area averages shrink a photo, cubic interpolation enlarges a photo."""
+    """Resize a photo ``[h,w,3]``: area averages shrink photos, cubic interpolation enlarges photos."""
     if width * height < photo.shape[0] * photo.shape[1]:
         resized = cv2.resize(photo, (width, height), interpolation=cv2.INTER_AREA)
     else:

@@ -130,7 +130,7 @@ def collect_page_data(
     stills: Stills = {}
 
     def add_still(result: str, split: str, view: int, image: np.ndarray) -> None:
-        """Keep a rendered view as an encoded still."""
+        """Keep the render ``[h,w,3]`` of a view of a split as an encoded still."""
         stills[result, split, view] = encode_still(to_picture(image))
 
     options = EvaluateOptions((LPIPS,) if lpips_available(LPIPS) else (), None, fog=False)
@@ -224,7 +224,7 @@ def _list_views(
 
 
 def _draw_outside_view(scene: Scene, named: Mapping[str, Gaussians], frame: Frame, place: int) -> PageView:
-    """Draw the scene and its results from outside the capture.
+    """Draw the scene and its results from outside the capture, as view ``place`` of the page.
 
     ``named`` are the Gaussians of the scene and of the results, in the scene's world.
     """
@@ -285,7 +285,7 @@ def _collect_side(
     *,
     light: bool,
 ) -> Side:
-    """Collect the data of one side of a page: scores and packed Gaussians.
+    """Collect the data of one side of a page: mean scores over ``split``, and packed Gaussians.
 
     ``gaussians`` and ``cameras`` are in the canonical frame.
     """

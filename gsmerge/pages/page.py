@@ -214,7 +214,8 @@ def list_figures(data: ViewData, side_id: int) -> list[Figure]:
 def _score_figure(label: str, name: str, old: float | None, new: float | None, *, own: bool, is_result: bool) -> Figure:
     """Make the figure of a mean score, which is ``old`` for the scene itself and ``new`` for one side of the page.
 
-    ``own`` is True if scores are over the photos of the fit. ``is_result`` is True if the side is not the scene itself.
+    ``label`` is shown, and ``name`` is the metric. ``own`` is True if scores are over the photos of the fit.
+    ``is_result`` is True if the side is not the scene itself.
     """
     digits, unit = (2, " dB") if name == "psnr" else (3, "")
     is_better = is_result and old is not None and new is not None and old < new
@@ -291,7 +292,7 @@ def _round_finite(value: float | None) -> float | None:
 
 
 def data_uri(content: bytes, kind: str) -> str:
-    """Encode content as a ``data:`` address."""
+    """Encode content of the media type ``kind`` as a ``data:`` address."""
     return f"data:{kind};base64,{base64_text(content)}"
 
 
@@ -301,7 +302,7 @@ def base64_text(content: bytes) -> str:
 
 
 def render_template(name: str, policy: str, **values: Any) -> str:
-    """Fill a template with values, which are escaped unless the template says otherwise.
+    """Fill the template file ``name`` with values, which are escaped unless the template says otherwise.
 
     ``policy`` is the page's content security policy. The policy's ``{script}`` and ``{style}`` become the hashes of the
     page's scripts and styles.
@@ -313,7 +314,7 @@ def render_template(name: str, policy: str, **values: Any) -> str:
 
 
 def _hashes(page: str, kind: str) -> list[str]:
-    """Return the hashes of a page's own scripts or styles, as a content security policy names them."""
+    """Return hashes of a page's "script" or "style" elements (``kind``), as a content security policy names them."""
     # Elements with a type attribute hold data, which a browser does not run
     contents = re.findall(f"<{kind}>(.*?)</{kind}>", page, re.DOTALL)
     digests = [hashlib.sha256(content.encode()).digest() for content in contents]

@@ -247,7 +247,8 @@ def _fit_slack(options: CompactOptions) -> float:
 def _check_result(case: Case, base: _ScoredResult, result: _ScoredResult, slack: float) -> tuple[bool, str]:
     """Compare a result with its own input, or with the result ``base`` of the unchanged scene, as the case requires.
 
-    Returns True if the property of the case holds, and the compared figures.
+    Returns True if the property of the case holds, and the compared figures. ``slack`` is how many dB more a result may
+    lose because of its fit.
     """
     figures = f"{len(result.gaussians):,} Gaussians, {result.after:.2f} dB"
     with_base = f"{figures}; unchanged {len(base.gaussians):,}, {base.after:.2f} dB"

@@ -15,7 +15,7 @@ USUAL_SHARE = 0.044  # for this many Gaussians per pixel, a quarter of the pixel
 GROW_STEPS = 150  # runs with fewer steps do better when they begin with all their Gaussians
 # A run grows only if it has at least this many steps for each photo, because each step draws one photo, and each photo
 # has to be drawn before the growth. With fewer steps, a real scene of 100 views has 20.9 dB without growth, and 20.7 dB
-# with growth. Without growth it takes .6 of the time that it takes with growth
+# with growth. Without growth the fit takes .6 of the time that it takes with growth
 GROW_ROUNDS = 2
 
 

@@ -78,8 +78,7 @@ else:  # the values that were drawn for one scene, under the names of their rang
 def draw_noise(options: NoiseOptions, rng: np.random.Generator, factor: float = 1.0) -> Noise:
     """Draw the values of one scene from their ranges.
 
-    ``factor`` multiplies the values of ``ERRORS``. The products for shares of pixels and for ``bleed`` are then cut to
-    1.
+    ``factor`` multiplies the values of ``ERRORS``. Shares of pixels and ``bleed`` are then cut to 1.
     """
     drawn: dict[str, float] = {}
     for name in NOISE_RANGES:

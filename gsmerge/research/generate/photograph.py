@@ -102,7 +102,7 @@ def screen_boxes(shapes: ShapeArrays, c2w: Array, lens: Pinhole, samples: int) -
 
 
 def _clipped_corners(shapes: ShapeArrays, c2w: Array) -> tuple[Array, Array]:
-    """Clip the bounding boxes of shapes at the near plane.
+    """Clip the bounding boxes of shapes at the near plane of the camera ``c2w [4,4]``.
 
     Returns points ``[m,20,3]`` in the camera's frame: the 8 corners, then the points where the 12 edges cross the near
     plane. A mask ``[m,20,1]`` is True for corners beyond the plane, and for edges that cross it.
@@ -123,7 +123,7 @@ def _clipped_corners(shapes: ShapeArrays, c2w: Array) -> tuple[Array, Array]:
 
 
 def trace(shapes: ShapeArrays, c2w: Array, lens: Pinhole, samples: int) -> Hits:
-    """Cast ``samples`` x ``samples`` rays for each pixel, and return their first hits."""
+    """Cast ``samples`` x ``samples`` rays for each pixel of the camera ``c2w [4,4]``, and return their first hits."""
     h, w = lens.height * samples, lens.width * samples
     hits = Hits(np.full((h, w), NO_SURFACE_DEPTH), np.full((h, w), -1, np.int32), *np.zeros((2, h, w, 3), np.float32))
     intrinsics = np.array([lens.focal, lens.focal, lens.width / 2, lens.height / 2])
@@ -145,7 +145,10 @@ def _shadow_map_axes(towards: Array) -> Array:
 
 
 def _shadow_map(shapes: ShapeArrays, axes: Array, middle: Array, radius: float, size: int) -> Float:
-    """Compute a shadow map ``[size,size]``: by how much the first surface is deeper than ``middle``."""
+    """Compute the shadow map ``[size,size]`` along ``axes [3,3]``, of all within ``radius`` of ``middle``.
+
+    A pixel says by how much the first surface is deeper than ``middle``.
+    """
     c2w = np.eye(4)
     behind = 1000.0  # distance of a shadow map's camera in radii, so that its rays are nearly parallel
     c2w[:3, :3], c2w[:3, 3] = axes.T, middle - behind * radius * axes[2]
@@ -273,7 +276,7 @@ def _reflect(lit: LitRoom, hits: Hits, rows: NDArray[np.int64], c2w: Array, lens
 
 
 def _incoming_light(lit: LitRoom, positions: Float, normals: Float) -> tuple[Float, Float]:
-    """Compute the direct and the ambient light ``[n]`` that arrives at points, with shadows."""
+    """Compute the direct and the ambient light ``[n]`` that arrives at ``positions [n,3]``, with shadows."""
     light, half_side = lit.room.light, lit.radius
     direct, indirect = np.zeros((2, len(positions)), np.float32)
     key_texels, ambient_texels = 2.0, 1.2  # texels by which a lit surface may lie behind the shadow map's depth

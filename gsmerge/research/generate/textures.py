@@ -47,7 +47,7 @@ def draw_octaves(
 
 
 def pixel_places(size: int) -> tuple[Grey, Grey]:
-    """Return x and y of the centres of all pixels, as shares of the picture's side."""
+    """Return x and y ``[size,size]`` of the centres of all pixels, as shares of the picture's side."""
     centres = (np.arange(size, dtype=np.float32) + 0.5) / size
     x, y = np.meshgrid(centres, centres)
     return x, y

@@ -110,7 +110,10 @@ def color_loss(image: Tensor, photo: Tensor, mask: Tensor, kind: str) -> Tensor:
 
 
 def masked_ssim(image: Tensor, photo: Tensor, mask: Tensor) -> Tensor:
-    """Average :func:`loss_ssim` of images ``[h,w,3]`` over the pixels of ``mask [h,w]``. An empty mask gives 1."""
+    """Average :func:`loss_ssim` of image and photo ``[h,w,3]`` over the pixels of ``mask [h,w]``.
+
+    An empty mask gives 1.
+    """
     if not bool(mask.any()):
         return torch.ones(())
     return (loss_ssim(image, photo).mean(-1) * mask).sum() / mask.sum()
@@ -230,8 +233,9 @@ def sibling_pairs(parents: Tensor) -> tuple[Tensor, Tensor]:
 def overlap_profile(gaussians: Gaussians, left: Tensor, right: Tensor) -> Tensor:
     """Compute the paper's penalty ``[p]`` of pairs that overlap too much or too little.
 
-    The penalty is 0 for pairs whose boxes have an intersection over union of a half. A box is parallel to the world's
-    axes, and reaches one standard deviation to each side, as in matching.
+    The pairs are rows ``left [p]`` and ``right [p]``. The penalty is 0 for pairs whose boxes have an intersection over
+    union of a half. A box is parallel to the world's axes, and reaches one standard deviation to each side, as in
+    matching.
     """
     axes = quat_to_rotmat(gaussians.quats) * gaussians.scales[:, None]
     halves = axes.norm(dim=2)

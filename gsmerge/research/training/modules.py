@@ -66,7 +66,7 @@ class Attention(nn.Module):
         self.query, self.pair, self.out = nn.Linear(width, width), nn.Linear(width, 2 * width), nn.Linear(width, width)
 
     def forward(self, x: Tensor, context: Tensor, mask: Tensor) -> Tensor:
-        """Return the attended values ``[b,q,w]``."""
+        """Return the attended values ``[b,q,w]``; the class names the shapes."""
         key, value = self.pair(context).chunk(2, -1)
         split = [t.unflatten(-1, (self.heads, -1)).transpose(1, 2) for t in (self.query(x), key, value)]
         mixed = scaled_dot_product_attention(split[0], split[1], split[2], attn_mask=mask[:, None, None])
@@ -87,7 +87,7 @@ class AttentionBlock(nn.Module):
         self.attention, self.mlp = Attention(width, heads), mlp(width, 2 * width, width)
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """Return the tokens ``[b,n,w]`` after attending to each other."""
+        """Return the tokens ``x [b,n,w]`` after attending to each other; ``mask [b,n]``."""
         context = self.before(x)
         if self.first_only:
             x = x[:, :1]
@@ -106,7 +106,7 @@ class Pooling(nn.Module):
         self.attention, self.mlp = Attention(width, heads), mlp(width, 2 * width, width)
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """Return one token for each set, ``[b,w]``."""
+        """Return one token ``[b,w]`` for each set ``x [b,n,w]`` with ``mask [b,n]``."""
         query = self.seed.expand(len(x), -1, -1)
         pooled = query + self.attention(query, self.before(x), mask)
         return (pooled + self.mlp(self.between(pooled)))[:, 0]
@@ -144,7 +144,7 @@ class Encoder(nn.Module):
         self.latent, self.shift = nn.Linear(options.width, options.latent), zero_init(nn.Linear(options.width, 3))
 
     def forward(self, tokens: Tensor, mask: Tensor, group: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the raw latent ``[b,latent]`` and the raw shift ``[b,3]``."""
+        """Return the raw latent ``[b,latent]`` and the raw shift ``[b,3]``; arguments as in :class:`SetNetwork`."""
         hidden = nn.functional.gelu(self.set(tokens, mask, group))
         return self.latent(hidden), self.shift(hidden)
 

@@ -274,7 +274,11 @@ class TrainingContext(NetworkContext):
     def make_tokens(
         self, parts: Gaussians | Members, ids: np.ndarray, owners: np.ndarray, group_features: GroupFeatures
     ) -> Array:
-        """Make tokens: tensors for Gaussians, and arrays for members, since no network changes members."""
+        """Make tokens.
+
+        Tokens are tensors for Gaussians, and arrays for members, since no network changes members. The arguments are
+        those of :func:`gsmerge.networks.tokens.part_tokens`.
+        """
         if isinstance(parts, Gaussians):
             return differentiate_tokens(parts, ids, owners, group_features)
         return super().make_tokens(parts, ids, owners, groups_to_arrays(group_features))

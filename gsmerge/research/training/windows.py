@@ -117,7 +117,7 @@ def _choose_photo(example: Example, novel: float, rng: np.random.Generator) -> t
 
 
 def _reaching_rows(example: Example, photo: int, box: Box) -> np.ndarray:
-    """Return the rows of the Feature Gaussians that reach into a box of a photo, or may by corrections."""
+    """Return the rows of the Feature Gaussians that reach into a box of a photo, or may after corrections."""
     border = 4  # width, in pixels, of the frame around the box from which corrections may move Gaussians into it
     wide = Box(box.left - border, box.top - border, box.width + 2 * border, box.height + 2 * border)
     tiled = tile_view(
