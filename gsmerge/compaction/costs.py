@@ -82,8 +82,7 @@ class RunCosts:
         return [*parts, *self.end_parts(count, level_counts(count, self.settings["levels"], limits.min_count))]
 
     def build_part(self, count: float, steps: int | None = None) -> RunPart:
-        """Return the part that builds ``count`` Gaussians with a fit of ``steps``; None: the run's steps.
-        """
+        """Return the part that builds ``count`` Gaussians with a fit of ``steps``; None: the run's steps."""
         settings, steps = self.settings, self.steps if steps is None else steps
         method = settings["method"]
         work = COST_PAIRS if self.merges_pairs else COST_BUILD

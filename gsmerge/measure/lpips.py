@@ -167,7 +167,7 @@ def _sum_differences(
 
 @lru_cache(maxsize=MAX_CACHED)  # successive calls often have the same reference, for one network or both
 def _cached_features(reference: bytes, shape: tuple[int, ...], path: Path, net: str) -> list[np.ndarray]:
-    """Compute and cache the unit features of a reference image. A cache takes float32 values as bytes, not as array."""
+    """Compute and cache the unit features of an image of a ``shape``, whose float32 values a cache takes as bytes."""
     return list(_unit_features(np.frombuffer(reference, np.float32).reshape(shape), _load_layers(path, net)))
 
 

@@ -92,7 +92,7 @@ class LitRoom:
 
 
 def screen_boxes(shapes: ShapeArrays, c2w: Array, lens: Pinhole, samples: int) -> NDArray[np.int32]:
-    """Compute in which samples of a picture each shape can appear: a box ``[m,4]`` of x0, y0, x1 and y1."""
+    """Compute boxes ``[m,4]`` of x0, y0, x1, y1: the samples in which the camera ``c2w`` may see each shape."""
     points, valid = _clipped_corners(shapes, c2w)
     pixels = points[..., :2] / np.where(valid, points[..., 2:], 1) * lens.focal + [lens.width / 2, lens.height / 2]
     limits = np.array([lens.width, lens.height]) * samples
