@@ -1,7 +1,7 @@
 """Exceptions for problems that a user can fix, each with its exit code.
 
 Invalid arguments of the Python API raise ``ValueError``. Problems with files and their content raise one of these
-exceptions; the command line prints its message as one line.
+exceptions; the command line prints the message of an exception as one line.
 """
 
 from __future__ import annotations

@@ -166,7 +166,10 @@ def _unwrap(name: str, values: Any) -> Any:
 
 
 def _get(owner_name: str, owner: Any, name: str) -> Any:
-    """Return a field of an object, or an entry of a mapping, by its name; SceneError if it is missing or None."""
+    """Return a field of an object, or an entry of a mapping, by its name.
+
+    Raises SceneError if the field or entry is missing or None.
+    """
     value = owner.get(name) if isinstance(owner, Mapping) else getattr(owner, name, None)
     if value is None:
         remedy = "run the model with infer_gs=True" if name == "gaussians" else ""

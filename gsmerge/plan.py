@@ -277,7 +277,7 @@ def choose_for_scene(
     """Make the decisions that follow from the scene's size and the options; UsageError for impossible options.
 
     ``num_input``: see :func:`gsmerge.facts.counts.count_limits`. ``keeps``: what :func:`keeps_fidelity` has returned
-    for the options of the caller; None: what it returns for ``options``.
+    for the options of the caller; None: what this function returns for ``options``.
     """
     keeps = keeps_fidelity(scene, options) if keeps is None else keeps
     if scene.num_views == 0 and options.fit.fit_steps is None and not EFFORTS[options.effort].fits_alone:
@@ -302,7 +302,10 @@ def choose_for_scene(
 
 
 def choose_blocks(scene: SceneSize, options: CompactOptions) -> int:
-    """Return the number of blocks for a scene; UsageError if it cannot be cut into the number that was asked for."""
+    """Return the number of blocks for a scene.
+
+    Raises UsageError if the scene cannot be cut into the number that was asked for.
+    """
     shared = [] if scene.has_own_pixels else ["a scene whose views have no Gaussians of their own"]
     problems = [*options.uncut, *shared]
     count = wanted_blocks(options, scene.num_gaussians, scene.num_views)
@@ -318,7 +321,10 @@ def choose_blocks(scene: SceneSize, options: CompactOptions) -> int:
 
 
 def usual_blocks(num_gaussians: int, num_views: int) -> int:
-    """Return the number of blocks that a scene has by default; if only its views are many, at most this number."""
+    """Return the number of blocks that a scene has by default.
+
+    A scene of which only the views are many has at most this number.
+    """
     if num_gaussians > WHOLE_GAUSSIANS:
         return -(-num_gaussians // BLOCK_GAUSSIANS)
     return 1 if num_views <= WHOLE_VIEWS else -(-num_views // BLOCK_VIEWS)
@@ -327,7 +333,7 @@ def usual_blocks(num_gaussians: int, num_views: int) -> int:
 def wanted_blocks(options: CompactOptions, num_gaussians: int, num_views: int = 0) -> int:
     """Return the largest number of blocks that a run may have by its options; 1 for a run in one piece.
 
-    ``num_views`` only matters if there are many.
+    ``num_views`` only matters if it is large.
     """
     blocks = options.blocks.blocks
     if blocks == "auto":
@@ -374,7 +380,7 @@ def choose_networks(options: CompactOptions, size: SceneSize) -> str:
 
 
 def load_networks(options: CompactOptions, size: SceneSize) -> Checkpoint | None:
-    """Load the networks that a run uses; None if it uses none.
+    """Load the networks that a run uses; None if a run uses no networks.
 
     Raises SceneError if networks are required and cannot be used, and UsageError if they do not fit the options.
     """
@@ -466,7 +472,7 @@ def _resolve_clean(options: CleanOptions, prepared: Prepared) -> CleanOptions:
 
 
 def resolve_decode(options: CompactOptions, scene: SceneSize) -> DecodeOptions:
-    """Choose K if it is "auto": 4 if all views have the same camera and no long fit follows, otherwise 1.
+    """Choose K if the option is "auto": 4 if all views have the same camera and no long fit follows, otherwise 1.
 
     A single view has too few Gaussians with K = 1, because superpixels are only 4.4 % of its pixels. With several
     cameras, each surface gets Gaussians from several views.

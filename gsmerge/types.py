@@ -348,10 +348,11 @@ class Scene(ArrayFields):
         images: ``[v,h,w,3]`` photos, sRGB in [0, 1], float32; None: no photos. A run also accepts uint8.
         pixels: The pixel of each Gaussian, and the Gaussian in front of each pixel; None: not known yet.
         names: The views' names, which are the image file names if these are known; None: numbers.
-        large_photos: The photos at a size with more pixels than the views; None: they have no more pixels.
+        large_photos: The photos at a size with more pixels than the views; None: the photos have no more pixels.
         masks: ``[v,h,w]`` bool, True where a photo counts; None: everywhere. All False for a view without a photo.
         importance: ``[v,h,w]`` float32, how many pixels each pixel counts for in a fit; None: one each.
-        filled: ``[n]`` bool, True for Gaussians that are not in the file, and were added to fill holes; None: no such.
+        filled: ``[n]`` bool, True for Gaussians that are not in the file, and were added to fill holes; None: no
+            Gaussians were added.
         region: The scene has no Gaussians outside of this region, as after a crop; None: no limit.
         notes: Notes from reading the files, for the report of a run; some are doubts.
 

@@ -48,8 +48,8 @@ def main(args: Sequence[str] | None = None) -> int:
 def _open_streams() -> None:
     """Make sure that stdout and stderr exist and accept any character, since file names may contain any.
 
-    If the caller closed descriptor 0, 1 or 2, it becomes the null device. Otherwise the next file to be opened would
-    get its number, and what a process of a batch prints would go into that file.
+    If the caller closed descriptor 0, 1 or 2, it becomes the null device. If the descriptor stayed closed, the next
+    file to be opened would get its number, and what a process of a batch prints would go into that file.
     """
     for descriptor in range(3):
         try:

@@ -159,8 +159,8 @@ def root(
 def _orderly_stop(signals: list[signal.Signals]) -> Iterator[None]:
     """Let SIGTERM and SIGHUP end the block as Ctrl-C does, without unfinished files.
 
-    Each such signal is added to ``signals``. Signals that the caller handles or ignores, as under nohup, keep their
-    handlers.
+    Each signal that arrives is added to ``signals``. Signals that the caller handles or ignores, as under nohup, keep
+    their handlers.
     """
     default_handlers = {signal.SIGINT: signal.default_int_handler}
     default_handlers |= {  # Windows has no SIGHUP

@@ -30,7 +30,7 @@ def inspect(args: opt.Args) -> None:
 
 
 def _inspect_scene(args: opt.Args, path: Path) -> None:
-    """Describe a scene in detail; SceneError if ``compact`` refuses it."""
+    """Describe a scene in detail; SceneError if ``compact`` refuses the scene."""
     from gsmerge.inspection.file_checks import check_content
     from gsmerge.inspection.inspect import inspect as inspect_scene
     from gsmerge.inspection.inspect import inspection_lines

@@ -1,9 +1,9 @@
 """Declare the options of the command line, each once, and turn their values into settings.
 
-A command is a function of one :class:`Args`. The decorator :func:`command` lists its parameters for Typer: names of
-options that are declared here, and declarations that only this command has. An option for a setting of the library has
-the setting's name and no default. The setting gives its help, its values and the default that the help shows
-(:func:`setting_option`).
+A command is a function of one :class:`Args`. The decorator :func:`command` lists the parameters of a command for Typer:
+names of options that are declared here, and declarations that only this command has. An option for a setting of the
+library has the setting's name and no default. The setting gives its help, its values and the default that the help
+shows (:func:`setting_option`).
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ class Args(SimpleNamespace):
 
     @property
     def opacity(self) -> OpacityChoice:
-        """How the file stores opacities, by ``--hint``; "auto" if no hint says it."""
+        """How the file stores opacities, by ``--hint``; "auto" if no hint says how."""
         choice: OpacityChoice = self._parse_hints().get("opacity", "auto")
         return choice
 

@@ -97,8 +97,7 @@ def render(args: opt.Args) -> None:
 def _choose_kind(args: opt.Args) -> str:
     """Return the kind of drawing, by the name of the output and the options.
 
-    UsageError if output and options do not fit each other.
-    A clip without ``--path`` gets the path "orbit".
+    Raises UsageError if output and options do not fit each other. A clip without ``--path`` gets the path "orbit".
     """
     suffix = args.output.suffix.lower()
     is_clip, is_picture = suffix in CLIPS, suffix in PICTURES

@@ -74,9 +74,9 @@ def compact_in_blocks(
 ) -> CompactResult:
     """Compact a scene in blocks of views.
 
-    First the views of each block are merged, and each block keeps the Gaussians that belong to it. All blocks together
-    then have one set of Gaussians. Each block fits the Gaussians that its views see, including Gaussians of its
-    neighbours, and keeps its own Gaussians. At the border of two blocks, both fit the same Gaussians to the same
+    First the views of each block are merged, and each block keeps the Gaussians that belong to it. The sets of all
+    blocks are joined into one set of Gaussians. Each block fits the Gaussians that its views see, including Gaussians
+    of its neighbours, and keeps its own Gaussians. At the border of two blocks, both fit the same Gaussians to the same
     photos.
     """
     device, scene = scene.gaussians.device, scene.numpy()

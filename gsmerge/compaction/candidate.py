@@ -50,8 +50,8 @@ def rescore(candidate: Candidate, gaussians: Gaussians, prepared: Prepared, plan
 def _measure_candidate(gaussians: Gaussians, moved: Prepared, plan: Plan) -> tuple[float | None, float | None]:
     """Return ``psnr`` and ``deciding_psnr`` of a candidate with these Gaussians of the world.
 
-    Both are measured against photos, or against renders of the input if the renders stand for photos. Both are None
-    without photos and renders. ``moved`` is the scene with the cameras of the fit.
+    Both PSNR are measured against photos, or against renders of the input if the renders stand for photos. Both PSNR
+    are None without photos and renders. ``moved`` is the scene with the cameras of the fit.
     """
     if moved.reference.name == RENDERS:
         fidelity = _measure_fidelity(moved.frame.enter(round_for_output(gaussians, plan)), moved, plan)

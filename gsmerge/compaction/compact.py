@@ -133,7 +133,7 @@ def _compact_simpler(scene: Scene, options: CompactOptions, result: CompactResul
 
 
 def _compact_once(scene: Scene, options: CompactOptions) -> CompactResult:
-    """Compact a scene: in blocks if its views are cut into several, otherwise in one piece."""
+    """Compact a scene: in blocks if the views are cut into several blocks, otherwise in one piece."""
     size, budget = measure_size(scene), options.budget
     if budget.number is not None and budget.number > size.num_gaussians:
         note(f"budget {budget.budget}: the input has only {size.num_gaussians:,} Gaussians, so the result has no more")
@@ -152,8 +152,8 @@ def _compact_once(scene: Scene, options: CompactOptions) -> CompactResult:
 def compact_in_one_piece(prepared: Prepared, method: Method, options: CompactOptions) -> CompactResult:
     """Compact a prepared scene with a method, in one piece.
 
-    A search finds the number of Gaussians, unless the options state it, and builds the result. Then its coarser levels
-    are built, a trial measures what new views gain, and the input is scored for the report.
+    A search finds the number of Gaussians, unless the options state it, and builds the result. After the result its
+    coarser levels are built, a trial measures what new views gain, and the input is scored for the report.
     """
     plan = add_target(make_plan(prepared, options), prepared)  # from here on, the plan replaces the options
     costs = measure_costs(prepared, plan)
@@ -269,8 +269,8 @@ def _record_dropped(dropped: dict[str, int], remaining: int, count: int | None, 
     from gsmerge.stages.clean import describe_counts
 
     record_choices(clean=dropped)
-    # The input was cropped before the run. Here only Gaussians are cropped that the fit moved across the border, and
-    # usually there are none
+    # The input was cropped before the run. The crop below only removes Gaussians that the fit moved across the border,
+    # usually none
     shown = {name: number for name, number in dropped.items() if number or name != "cropped"}
     if shown:
         note(f"left out by clean-up: {describe_counts(shown, placed=prepared.reference.placed)}")

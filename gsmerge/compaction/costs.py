@@ -70,8 +70,8 @@ class RunCosts:
     def all_parts(self, limits: CountLimits, count: int) -> list[RunPart]:
         """Return the parts that a run for about ``count`` Gaussians is expected to have, in their order.
 
-        First come the fits of a curve, if there is one. Then come the build of the result, or those of all candidates
-        of a search. The parts of :meth:`end_parts` follow.
+        First come the fits of a curve, if there is one. After the curve comes the build of the result, or the builds of
+        all candidates of a search. The parts of :meth:`end_parts` follow.
         """
         choice = self.choice
         builds_of_search = USUAL_BUILDS_OF_RENDERS if choice.rendered else USUAL_BUILDS

@@ -63,8 +63,8 @@ def measure_curve(
 ) -> list[CurvePoint]:
     """Measure PSNR and SSIM, at full size, of short fits with each of the ``counts``.
 
-    Every fit takes ``steps`` steps, whatever the plan says. It is scored on the photos of ``left_out`` or, without
-    them, on patches of all photos that the fit leaves out.
+    Every fit takes ``steps`` steps, whatever the plan says. Each fit is scored on the photos of ``left_out`` or,
+    without them, on patches of all photos that the fit leaves out.
     """
     holdout = 0.1  # share of the photos' patches that the fits leave out
     short = replace(

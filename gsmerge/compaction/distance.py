@@ -42,7 +42,7 @@ def is_clearly_worse(input_psnr: float | None, result_psnr: float | None) -> boo
 
 @stage("input")
 def describe_clear_loss(gaussians: Gaussians, prepared: Prepared) -> str | None:
-    """Say that a result is clearly worse than its input in pictures between the views; None if it is not.
+    """Say that a result is clearly worse than its input in pictures between the views; None if the result is not.
 
     ``gaussians`` are the canonical Gaussians of the result. The scene has photos.
     """

@@ -65,7 +65,7 @@ OWN_METHOD = _OwnMethod(OURS, lambda *arguments: build(*arguments).gaussians)
 
 
 def find_method(options: CompactOptions) -> Method:
-    """Load the method that the options name; UsageError if a program that it runs is missing."""
+    """Load the method that the options name; UsageError if a program that the method runs is missing."""
     if options.method == OURS:
         return OWN_METHOD
     method: Method = load_plugin(METHODS, options.method)
@@ -76,7 +76,7 @@ def find_method(options: CompactOptions) -> Method:
 def is_without_views(scene: Scene, options: CompactOptions) -> bool:
     """Return whether a run works without views: the scene has none, and no option asks for a stage that needs views.
 
-    Gaussians are then merged with their neighbours, by positions and colours alone.
+    Without views, Gaussians are merged with their neighbours, by positions and colours alone.
     """
     return len(scene) == 0 and not options.replaces_stages
 

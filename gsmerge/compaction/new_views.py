@@ -1,8 +1,8 @@
 """Estimate how much new views gain, by a trial on small photos that a short fit has not seen.
 
-Scores on photos that a fit has seen only say how well it remembers them. So the trial leaves out some views with their
-Gaussians, and compacts the other views at a small size. The photos that were left out then score the Gaussians of the
-other views before and after compaction, over the pixels that the other views see.
+Scores on photos that a fit has seen only say how well the fit remembers these photos. The trial therefore leaves out
+some views with their Gaussians, and compacts the other views at a small size. The photos that were left out then score
+the Gaussians of the other views before and after compaction, over the pixels that the other views see.
 """
 
 from __future__ import annotations
@@ -132,7 +132,7 @@ def _score_round(prepared: Prepared, views: Sequence[int], plan: Plan, build: Bu
         return None
     superpixels = max(1, round(share * small.pixels_per_view))
     trial_plan = left_out.plan(plan, superpixels=superpixels, k=1, fit_steps=min(TRIAL_STEPS, plan.fit.steps))
-    # The fit draws no views from outside, and nothing is pruned. Both hardly change the score
+    # The fit draws no views from outside, and nothing is pruned. Views from outside and pruning hardly change the score
     # (docs/internals/notebook.md)
     fit = replace(trial_plan.fit, tuning=replace(trial_plan.fit.tuning, outside_from=1.0))
     compacted = build(left_out.rest, replace(trial_plan, fit=fit, is_trial=True), None).gaussians

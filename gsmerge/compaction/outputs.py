@@ -36,7 +36,7 @@ class Outputs:
 
     @property
     def format(self) -> Format:
-        """The format of the result; UsageError if its name has no ending that can be written."""
+        """The format of the result; UsageError if the name has no ending that can be written."""
         return output_format(self.result)
 
     @property

@@ -153,8 +153,8 @@ def partition_apart(weights: np.ndarray, count: int) -> list[Block]:
 def grow_blocks(weights: np.ndarray, count: int) -> np.ndarray:
     """Return the block of each view ``[v]``, 0 to ``count - 1``; blocks grow one after another.
 
-    A free view has no block yet. A block begins with the free view that has the weakest edges to other free views. It
-    grows by the free view that shares most with the block.
+    A free view has no block yet. A block begins with the free view that has the weakest edges to other free views. The
+    block grows by the free view that shares most with it.
     """
     num_views = len(weights)
     labels, is_free = np.full(num_views, -1), np.ones(num_views, bool)

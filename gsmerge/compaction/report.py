@@ -79,13 +79,13 @@ class CompactReport:
         notes: Warnings about the input and notes about what was adapted to it, one sentence each.
         options: All settings by flat name.
         peak_memory_bytes: Largest resident memory of the process so far.
-        unmet: Why a target that was asked for is not met, and how near the result came; None if it is met.
+        unmet: Why a target that was asked for is not met, and how near the result came; None if the target is met.
         worse: A warning that the result is worse than the input, which is also among the notes; None if the result is
             not worse, or if this cannot be measured. The result is worse if it shows the scene's own photos more than
             .5 dB worse than the input, or if ``is_far`` is true. If ``fidelity`` is measured, the result is worse if
             its ``psnr`` is below 30 dB. docs/reference/report.md lists all cases.
         psnr_reference: What the PSNR of the input views is measured against: "photos" or "the model's own pixels"; None
-            if it is not measured.
+            if the PSNR is not measured.
         covered: PSNR over the pixels that the input covers; None if the input covers at least 98 % of all pixels.
         is_far: The result is clearly worse than the input. Either the result's pictures differ from the photos more
             than twice as much as the input's pictures. Or, between the views, the result's pictures differ from the

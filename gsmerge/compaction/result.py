@@ -115,7 +115,7 @@ class CompactResult:
         return f"CompactResult({self.gaussians!r}, {self.cameras!r}{levels})"
 
     def to_single(self) -> CompactResult:
-        """Return the same result with float32 means; its Gaussians have to be NumPy arrays, not tensors."""
+        """Return the same result with float32 means; the Gaussians have to be NumPy arrays, not tensors."""
         coarser = tuple(level.to_single() for level in self.coarser)
         return replace(self, gaussians=replace(self.gaussians, means=to_float32(self.gaussians.means)), coarser=coarser)
 

@@ -31,7 +31,7 @@ SEAM_RATE = 0.6
 
 
 def fit_seams(joined: Gaussians, owners: np.ndarray, starts: Sequence[BlockStart], seed: int) -> Gaussians:
-    """Fit the Gaussians at seams again, to the photos of all blocks that show them; the others stay unchanged.
+    """Fit the Gaussians at seams again, to the photos of all blocks that show them; other Gaussians stay unchanged.
 
     The fit of a block also changed the block's copies of neighbouring blocks' Gaussians, which are not in the result.
     At the seams, a block's Gaussians therefore do not fit the Gaussians of its neighbours. ``owners [n]`` is the block

@@ -215,7 +215,8 @@ def add_target(plan: Plan, prepared: Prepared) -> Plan:
 def search_count(prepared: Prepared, plan: Plan, build: Build) -> CountSearch:
     """Return the search for the number of Gaussians, before its first build.
 
-    Without a quality target, the search has one count. If the scene's curve decides it, the curve is measured here.
+    Without a quality target, the search has one count. If the scene's curve decides the number, the curve is measured
+    here.
     """
     limits, left_out = plan.limits, leave_out_for_scores(prepared, plan)
     agreement, most = prepared.agreement, limits.max_count

@@ -86,7 +86,7 @@ def compact_tensors(
         shape: Views, height and width; None: those of the images.
         names: Names of the views; None: numbers.
         order: ``"view-major"``: one Gaussian per pixel, view after view; ``"none"``: Gaussians without pixels (trained
-            scenes, voxels); cameras are then optional.
+            scenes, voxels); Gaussians without pixels need no cameras.
         progress: See :func:`gsmerge.compact`.
         **settings: Settings of :func:`gsmerge.compact`, such as ``budget="4%"``, ``k=2``.
 
@@ -177,7 +177,7 @@ def _copy_rows(name: str, values: Any, *row_shape: int) -> np.ndarray:
 
 
 def _check_gaussians(columns: dict[str, np.ndarray]) -> tuple[Gaussians, np.ndarray, list[str]]:
-    """Check columns, and make Gaussians of them; SceneError if their values have another convention.
+    """Check columns, and make Gaussians of them; SceneError if the values have another convention.
 
     The columns are changed in place: rows with NaN or infinities become transparent, opacities are cut to [0, 1], and
     quaternions get the length 1. Returns the Gaussians, a mask ``[n]`` of the rows that are finite and not empty, and

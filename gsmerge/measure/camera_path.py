@@ -1,4 +1,7 @@
-"""Make cameras from those of a scene: along a path for videos, or one outside the capture. All are in float64."""
+"""Make cameras from those of a scene: along a path for videos, or one outside the capture.
+
+All cameras are in float64.
+"""
 
 from __future__ import annotations
 

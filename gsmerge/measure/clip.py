@@ -155,7 +155,7 @@ class FfmpegWriter:
 
 
 def find_ffmpeg(encoder: str) -> str | None:
-    """Find the program ffmpeg on the PATH. Returns None if it is missing, or does not have the ``encoder``."""
+    """Find the program ffmpeg on the PATH. Returns None if the program is missing, or does not have the ``encoder``."""
     program = shutil.which("ffmpeg")
     with suppress(OSError):
         if program is not None:
@@ -172,11 +172,12 @@ def stored_size(path: StrPath, width: int, height: int) -> tuple[int, int]:
 
 
 def write_clip(path: StrPath, frames: Iterable[BytePicture], fps: float, *, overwrite: bool = False) -> str:
-    """Write pictures ``[h,w,3]`` of one size as a video or a GIF; return the name of its encoding.
+    """Write pictures ``[h,w,3]`` of one size as a video or a GIF; return the name of the file's encoding.
 
-    A ``.mp4`` has the encoding H.264 if :func:`find_ffmpeg` finds a program for it, otherwise the first encoding that
-    OpenCV has. All frames of a GIF share a palette, and are in memory together. A video takes the memory of a few
-    frames. Its frames have the :func:`stored_size`: an odd side gets one more row or column, a copy of the last one.
+    A ``.mp4`` has the encoding H.264 if :func:`find_ffmpeg` finds a program for H.264, otherwise the first encoding
+    that OpenCV has. All frames of a GIF share a palette, and are in memory together. A video takes the memory of a few
+    frames. The frames of a video have the :func:`stored_size`: an odd side gets one more row or column, a copy of the
+    last one.
 
     Raises SceneError if there is no encoder for the ending of the name, or if the file cannot be written completely.
     """
@@ -235,8 +236,8 @@ def _open_writer(
 ) -> tuple[cv2.VideoWriter | FfmpegWriter, str]:
     """Open the file ``temporary`` with the first available encoder; return the writer, and the encoding's name.
 
-    All frames have ``shape``. ``path`` is the name that the file will get: its ending decides about the encoders, and
-    messages name it.
+    All frames have ``shape``. ``path`` is the name that the file will get: the ending of ``path`` decides about the
+    encoders, and messages name ``path``.
     """
     height, width, _ = shape
     name, encoder, container, _ = H264

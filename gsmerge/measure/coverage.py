@@ -21,7 +21,7 @@ def extents(gaussians: Gaussians) -> dict[str, Any]:
         box's diagonal. ``share_outliers``: share of positions outside the box enlarged ten times. ``share_floaters``:
         share of isolated Gaussians and outliers. ``scale_median``: median of the Gaussians' largest scales.
         ``scale_max``: largest scale of all. ``share_huge``: share of Gaussians whose largest scale is above a tenth of
-        the diagonal. All are 0 if there are no Gaussians.
+        the diagonal. All figures are 0 if there are no Gaussians.
     """
     names = ("diagonal", "share_outliers", "share_floaters", "scale_median", "scale_max", "share_huge")
     if len(gaussians) == 0:

@@ -288,8 +288,9 @@ DRAWINGS = {"panel": prepare_panel, "views": prepare_pictures, "path": prepare_c
 
 
 def _read_scenes(options: DrawOptions, *, photos: bool) -> DrawnScenes:
-    """Read the scenes, and the cameras of ``options.framing``, which show them; if ``photos``, also read its photos.
+    """Read the scenes, and the cameras of ``options.framing``, which show them.
 
+    If ``photos``, also read photos of the framing.
     If there are no cameras, views are placed around the scene, and if ``photos`` also inside it.
     """
     files, framing, paths = options.files, options.framing, options.paths

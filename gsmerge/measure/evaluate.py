@@ -206,7 +206,7 @@ def evaluate(
         targets: Held-out views in that world, see :func:`gsmerge.scene.held_out.read_held_out`.
         options: Settings; None: the defaults, with LPIPS if its weights are installed.
         cameras: Cameras of the input views, by name of a result, if the result was made with other poses than the
-            scene has. They are ``CompactResult.cameras``.
+            scene has. A result has these cameras as ``CompactResult.cameras``.
         progress: Called with (name of the step, number done, total); the step of a result is "evaluate: NAME".
         on_image: Called with (result, split, number of the view in the split, render ``[h,w,3]`` in [0, 1]).
 

@@ -41,7 +41,10 @@ def fill_cameras(cameras: Cameras, width: int, height: int) -> Cameras:
 
 
 def fill_photo(photo: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Resize and crop a photo ``[h,w,3]`` to ``[height,width,3]``; :func:`fill_cameras` changes its camera likewise."""
+    """Resize and crop a photo ``[h,w,3]`` to ``[height,width,3]``.
+
+    :func:`fill_cameras` changes the photo's camera likewise.
+    """
     new_width, new_height = _filling_size(photo.shape[1], photo.shape[0], width, height)
     top, left = (new_height - height) // 2, (new_width - width) // 2
     return resize_photo(photo, new_width, new_height)[top : top + height, left : left + width]

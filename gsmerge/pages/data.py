@@ -87,9 +87,9 @@ class ViewData:
     def start(self) -> int:
         """Index of the view with which the page opens.
 
-        The page opens with the view of the median score, or with the first view if no view has scores. If there are
-        held-out views, only these are considered. If some of the considered views have LPIPS, only views with LPIPS are
-        considered.
+        The page opens with the view of the median score, or with the first view if no view has scores. Only held-out
+        views are considered if a page has held-out views. If some of the considered views have LPIPS, only views with
+        LPIPS are considered.
         """
         views = list(enumerate(self.views))
         held_out = [(i, view) for i, view in views if view.held_out] or views
@@ -306,7 +306,7 @@ def _collect_side(
 
 
 def _choose_shown(views: Sequence[PageView]) -> tuple[PageView, ...]:
-    """Choose ``MAX_SHOWN_VIEWS`` views and the worst view; return them worst first."""
+    """Choose ``MAX_SHOWN_VIEWS`` views and the worst view; return these views, the worst first."""
 
     def quality(view: PageView) -> float:
         """Return a view's PSNR of the first result, or of a scene without results; infinity if there is no PSNR."""

@@ -157,7 +157,7 @@ def speed(data: ViewData, side_id: int = 1) -> float | None:
 def speed_words(ratio: float | None) -> str:
     """Return the end of the headline, which says how much faster a result is drawn.
 
-    "" if the result is not clearly faster.
+    Returns "" if the result is not clearly faster.
     """
     min_ratio = 1.2  # the headline mentions a ratio of drawing times from this value on
     if ratio is None or ratio < min_ratio:

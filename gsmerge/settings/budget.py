@@ -127,7 +127,10 @@ def parse_quality(text: str) -> float:
 
 
 def parse_share(text: str) -> float:
-    """Parse a share such as "4.4%" into a number such as 0.044; ValueError unless it is above 0 and at most 1."""
+    """Parse a share such as "4.4%" into a number such as 0.044.
+
+    Raises ValueError unless the share is above 0 and at most 1.
+    """
     match = re.fullmatch(r"(\d*\.?\d+)\s*%", str(text).strip(), re.ASCII)
     share = Fraction(match[1]) / 100 if match else Fraction(0)
     if not 0 < share <= 1:

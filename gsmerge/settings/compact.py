@@ -1,6 +1,6 @@
 """Declare all settings of a run.
 
-They are grouped by stage. Users give each setting by its flat name, which is its name without the group.
+Settings are grouped by stage. Users give each setting by its flat name, which is its name without the group.
 """
 
 from __future__ import annotations
@@ -128,7 +128,10 @@ class CompactOptions(Settings):
 
     @property
     def changes_superpixels(self) -> bool:
-        """True if any setting changes how superpixels are cut, merged or decoded; their number does not count."""
+        """True if any setting changes how superpixels are cut, merged or decoded.
+
+        The number of superpixels does not count.
+        """
         kinds = (SegmentOptions, MatchOptions, DecodeOptions)
         return bool(self.changed([name for kind in kinds for name in flat_settings(kind) if name not in COUNTS]))
 

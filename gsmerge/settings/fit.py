@@ -21,7 +21,10 @@ GROW_ROUNDS = 2
 
 @dataclass(frozen=True)
 class Tuning:
-    """Constants of the fit, which were chosen on training scenes. They are no options: runs change a few themselves."""
+    """Constants of the fit, which were chosen on training scenes.
+
+    Users cannot set these constants, but runs change a few of them.
+    """
 
     means_lr: float = 0.1  # Step size of a mean, in units of the Gaussian's size
     scales_lr: float = 0.2  # Step size of a log scale
@@ -43,10 +46,10 @@ class Tuning:
     # Least scale, in pixels of the photo nearest to the Gaussian. Thinner Gaussians look like needles if a viewer
     # enlarges them. 0 sets no limit
     min_scale: float = 0.5
-    # A Gaussian is long if three standard deviations exceed `long_share` of the width of the nearest photo. Its longest
-    # axis may be at most `max_ratio` times its second one, because longer Gaussians look like strokes from other
-    # viewpoints. The limit `max_ratio` holds after the growth of a run. Before the growth there are few Gaussians,
-    # which fit better if they may be long
+    # A Gaussian is long if three standard deviations exceed `long_share` of the width of the nearest photo. A
+    # Gaussian's longest axis may be at most `max_ratio` times its second one, because longer Gaussians look like
+    # strokes from other viewpoints. The limit `max_ratio` holds after the growth of a run. Before the growth there are
+    # few Gaussians, which fit better if they may be long
     long_share: float = 0.25
     max_ratio: float = 3.0
     average_share: float = 0.2  # The parameters are averaged over this share of the steps, which are the last ones

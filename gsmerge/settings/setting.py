@@ -51,7 +51,7 @@ class Setting:
 
     @property
     def is_list(self) -> bool:
-        """True if the setting takes a list. Choices and range then apply to the elements of the list."""
+        """True if the setting takes a list. Choices and range of a list apply to the elements of the list."""
         return get_origin(self.kind) is tuple
 
     @property

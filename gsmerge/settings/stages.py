@@ -83,7 +83,7 @@ class SegmentOptions(Settings):
     def share(self) -> float:
         """Number of superpixels per pixel, if the setting is a share.
 
-        The default share if the setting is a number or "auto".
+        If the setting is a number or "auto", this is the default share.
         """
         is_share = self.per_view is None and self.superpixels != AUTO
         return parse_share(str(self.superpixels) if is_share else SHARE)

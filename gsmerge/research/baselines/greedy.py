@@ -1,6 +1,6 @@
 """Merge pairs greedily, the idea of NanoGS (2026) and of splat-transform's decimation.
 
-Each round builds a graph of nearest neighbours and computes the cost of merging each connected pair. It selects
+Each round builds a graph of nearest neighbours and computes the cost of merging each connected pair. Each round selects
 disjoint pairs by cost, and replaces each pair by the Gaussian with its moments, see :mod:`gsmerge.stages.pair_merge`.
 As in splat-transform, the mass of a Gaussian is its opacity times the area of its ellipsoid. A merged Gaussian has the
 sum of the masses, and an opacity of at most 1 that follows from the sum. The cost is Runnalls' bound on the

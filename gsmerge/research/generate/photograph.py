@@ -218,7 +218,7 @@ def texture_coordinates(shapes: ShapeArrays, ids: NDArray[np.int32], points: Flo
 def look_up_colors(lit: LitRoom, ids: NDArray[np.int32], points: Float, spread: Float) -> Float:
     """Look up the texture colours ``[n,3]``, sRGB, of points in the frames of the shapes ``ids [n]``.
 
-    ``spread [n]`` is the size of a sample at the point, in world units. It chooses the mipmap.
+    ``spread [n]`` is the size of a sample at the point, in world units. This size chooses the mipmap.
     """
     uv, repeat = texture_coordinates(lit.shapes, ids, points)
     textures = np.array([s.material.texture for s in lit.shapes.shapes])[ids]

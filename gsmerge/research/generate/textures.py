@@ -410,8 +410,8 @@ class Palette:
     def material(self, *kinds: str, repeat: float = 0.0, gloss: float | None = None) -> Material:
         """Make a material of a random one of ``kinds``, with a new texture until the kind has its number of textures.
 
-        ``repeat`` is the number of repeats per world unit. If it is 0, the texture covers every face once. ``gloss`` is
-        random by default, and zero in about half of the cases.
+        ``repeat`` is the number of repeats per world unit. If ``repeat`` is 0, the texture covers every face once.
+        ``gloss`` is random by default, and zero in about half of the cases.
         """
         kind = kinds[self.rng.integers(len(kinds))]
         other_textures = 3  # most textures of any other kind

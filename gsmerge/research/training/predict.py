@@ -369,8 +369,9 @@ def _merge(encoded: FeatureGaussians, matches: Matches, context: TrainingContext
 def _make_children(
     crop: Crop, arrays: FeatureGaussians, described: GroupFeatures, context: TrainingContext, k: int
 ) -> tuple[Gaussians | None, np.ndarray]:
-    """Make ``k`` children of every Feature Gaussian, by closed formulas; return them, and their parents ``[n]``.
+    """Make ``k`` children of every Feature Gaussian, by closed formulas.
 
+    Return the children, and their parents ``[n]``.
     Parents are rows of Feature Gaussians, ascending. The children are None if the heads make them themselves.
     """
     if context.makes_children:

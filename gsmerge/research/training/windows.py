@@ -100,8 +100,9 @@ def sample_window(
 
 
 def _choose_photo(example: Example, novel: float, rng: np.random.Generator) -> tuple[int, np.ndarray]:
-    """Choose a random photo with pixels that the example's views cover; return its number, and these pixels' indices.
+    """Choose a random photo with pixels that the example's views cover.
 
+    Return the number of the photo, and these pixels' indices.
     ``novel`` is the probability that novel views are tried first. If the views cover no pixel of any photo, the last
     tried photo is returned, and no indices.
     """
