@@ -422,8 +422,8 @@ def check_networks(checkpoint: Checkpoint, options: CompactOptions) -> None:
 def resolve_budget(size: SceneSize, options: CompactOptions, agreement: Agreement | None) -> CompactOptions:
     """Fill in the number of Gaussians beyond which new views gain nothing, with a note.
 
-    This number is larger the more the views confirm each other's depth. The number is the budget if the options say
-    "auto", and an upper limit for a budget that is a share, a size or a device.
+    The more the views confirm each other's depth, the larger is this number of Gaussians. The number is the budget if
+    the options say "auto", and an upper limit for a budget that is a share, a size or a device.
     """
     budget = options.budget
     is_limit = budget.is_limit and options.method == OURS
@@ -463,7 +463,7 @@ def _resolve_superpixels(options: SegmentOptions, agreement: Agreement | None, e
 
 
 def _resolve_clean(options: CleanOptions, prepared: Prepared) -> CleanOptions:
-    """Drop no sky if no photo shows where it is, and add a note."""
+    """Drop no sky if no photo shows where the sky is, and add a note."""
     if "sky" not in options.drops or prepared.reference.name != RENDERS:
         return options
     note("drop sky: no photo that is used shows where the sky is, so it is kept")

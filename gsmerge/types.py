@@ -417,7 +417,10 @@ class Scene(ArrayFields):
         return self.pixels is not None and self.pixels.own
 
     def get_pixels(self) -> Pixels:
-        """Return the pixels of a scene that has them, as every prepared scene does; AssertionError for another one."""
+        """Return the pixels of a scene that has them, as every prepared scene does.
+
+        AssertionError for any other scene.
+        """
         assert self.pixels is not None, "pixels are known"
         return self.pixels
 

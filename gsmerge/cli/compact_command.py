@@ -151,7 +151,7 @@ def _check_outputs(args: opt.Args, files: SceneFiles, settings: CompactOptions, 
     num_files = settings.budget.levels if outputs.format.levels == "apart" else 1
     levels = [level_output(outputs.result, level) for level in range(1, num_files)]
     networks = [] if settings.checkpoint in CHECKPOINTS else [Path(settings.checkpoint)]
-    # Results in several formats share a camera file, so it may exist unless it is to be replaced
+    # Results in several formats share a camera file, which may exist already, unless --overwrite replaces it
     replaced_cameras = outputs.viewer_cameras if args.overwrite else None
     paths = (*outputs.paths, *levels, replaced_cameras)
     check_outputs(paths, (*input_files(files), *networks), overwrite=args.overwrite or args.dry_run)

@@ -163,7 +163,7 @@ def adopt_records(outcomes: Iterable[tuple[T, Record]]) -> Iterator[tuple[T, dic
 
 
 def list_calls(starts: Sequence[BlockStart], *values: Any) -> Iterator[tuple[Any, ...]]:
-    """Yield the arguments of a call for each block: its start, the ``values``, and its number.
+    """Yield the arguments of a call for each block: the block's start, the ``values``, and the block's number.
 
     The caller sends the arguments of one block before it asks for the next, so that the memory of the sent arguments is
     released.
@@ -256,7 +256,7 @@ def block_options(
     """
     settings: dict[str, Any] = {**ONE_PIECE, "budget": None}
     settings["fit_steps"] = max(1, round(options.fit.steps * len(block.views) / len(scene)))
-    # with few steps, the share of steps that draw a quarter of the pixels would be another one than in the whole scene
+    # with few steps, the share of steps that draw a quarter of the pixels would differ from that in the whole scene
     if replace(options.fit, fit_steps=settings["fit_steps"]).half_res_part != options.fit.half_res_part:
         settings["half_res_share"] = options.fit.half_res_part
     superpixels = options.segment.superpixels

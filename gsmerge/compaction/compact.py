@@ -50,7 +50,7 @@ from gsmerge.types import Gaussians, Scene, StrPath
 from gsmerge.values.arguments import check_arguments
 
 # If a result is clearly worse than its input, the scene is compacted again with these changes of the options, one after
-# another, until a result is not. A note has the words
+# another, until a result is not clearly worse. A note has the words
 SIMPLER: Sequence[tuple[str, Callable[[CompactOptions], CompactOptions]]] = (
     ("with the scene's own colours in place of the photos", lambda o: o.with_settings({"look": "scene"})),
     ("without a fit", lambda o: o.with_settings({"fit": "none"})),
@@ -173,7 +173,7 @@ def compact_in_one_piece(prepared: Prepared, method: Method, options: CompactOpt
 
 
 def run_search(search: CountSearch, build: Build, prepared: Prepared) -> Candidate:
-    """Run a search for the number of Gaussians; return its best candidate, built from all views and cleaned up."""
+    """Run a search for the number of Gaussians; return the best candidate, built from all views and cleaned up."""
     plan = search.plan
     if search.left_out is not None:  # its candidates lack views, so the best count is built again
         search.run(partial(build_left_out, build, search.left_out, search.left_out.plan(plan)))

@@ -50,7 +50,7 @@ def curve_counts(max_drop: float | None, usual: int, least: int, most: int) -> t
     """Return the counts at which a curve is measured, ascending, and the steps of its short fits.
 
     The counts lie around the ``usual`` one, between ``least`` and ``most``. ``max_drop`` is the largest loss of quality
-    (dB) by which the curve decides the number; None: the knee decides it.
+    (dB) by which the curve decides the number; None: the knee decides the number.
     """
     shares, steps = [1 / 8, 1 / 4, 1 / 2, 1.0], 60  # shares of the usual count; this is enough to find the knee
     if max_drop is not None:

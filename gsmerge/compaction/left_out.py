@@ -52,7 +52,7 @@ class LeftOut:
         return max(1, round(count * views / (views + len(self.photos))))
 
     def plan(self, plan: Plan, **settings: Any) -> Plan:
-        """Plan a run on the other views with the settings of ``plan``, some of which ``settings`` replace.
+        """Plan a run on the views that remain with the settings of ``plan``, some of which ``settings`` replace.
 
         Settings that depend on the whole scene, such as a crop, are replaced by those of ``TRIAL``.
         """

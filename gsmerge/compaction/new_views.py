@@ -97,8 +97,8 @@ def try_new_views(prepared: Prepared, plan: Plan, build: Build, count: int) -> T
     """Run the trial for a result of ``count`` Gaussians, in two rounds, and return what it measured.
 
     None if the plan wants no trial, with too few photos, or with too many Gaussians. None also if views have no
-    Gaussians of their own, because the content of the left-out photos would remain in the Gaussians. The error of the
-    estimate would then be 2 dB instead of 1.2, and the trial would take a quarter of a run's time.
+    Gaussians of their own, because the content of the left-out photos would remain in the Gaussians. A trial with this
+    content has an error of 2 dB instead of 1.2 dB, and takes a quarter of a run's time.
     """
     if not plan.new_views or not can_try(prepared, count):
         return None

@@ -72,10 +72,10 @@ class CompactReport:
             photos, in drafts, and in blocks.
         psnr_after: Like ``psnr_before``, but rendered from the result. If the format of the output rounds positions
             visibly, the rounded Gaussians are rendered.
-        choices: Decisions of the stages (count, curve, search, merge, scores, clusters, fit). ``pruned`` is the number
-            of Gaussians that the result has less than allowed, because no view shows more. Without photos and pixels,
-            ``fidelity`` has the ``psnr`` (dB) against renders of the input, and the number of ``views`` of these
-            renders. ``held_out`` is true if the views were placed because the scene has no cameras.
+        choices: Decisions of the stages (count, curve, search, merge, scores, clusters, fit). ``pruned`` says by how
+            many Gaussians the result is smaller than allowed, because no view shows more Gaussians. Without photos and
+            pixels, ``fidelity`` has the ``psnr`` (dB) against renders of the input, and the number of ``views`` of
+            these renders. ``held_out`` is true if the views were placed because the scene has no cameras.
         notes: Warnings about the input and notes about what was adapted to it, one sentence each.
         options: All settings by flat name.
         peak_memory_bytes: Largest resident memory of the process so far.

@@ -61,7 +61,7 @@ class SearchFacts:
 
 @dataclass(eq=False)
 class CountSearch:
-    """Search for the number of Gaussians: it builds one count, or several until a quality is met."""
+    """Search for the number of Gaussians: the search builds one count, or several until a quality is met."""
 
     plan: Plan  # Has the target and the limits
     first: int | None  # The count to begin with; None: as many as `superpixels` and K give

@@ -113,8 +113,8 @@ def step_back(cameras: Cameras, depth: float, back: float) -> Cameras:
 def outside_camera(cameras: Cameras, means: np.ndarray) -> tuple[Cameras, float]:
     """Make a camera outside the capture: turn the middle camera about a point in front of it, and step back.
 
-    The point is at the median depth of the ``means [n,3]``. Returns the camera, and its distance from the point in
-    world units. The fog of a result is measured from such cameras as well, see :mod:`gsmerge.measure.fog`.
+    The point is at the median depth of the ``means [n,3]``. Returns the camera, and the camera's distance from the
+    point, in world units. The fog of a result is measured from such cameras as well, see :mod:`gsmerge.measure.fog`.
     """
     back, turn = FOG_CAMERAS["turned"][-1]
     middle, depth = cameras[[median_camera(cameras)]], viewing_depth(cameras, means)

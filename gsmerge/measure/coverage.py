@@ -42,9 +42,9 @@ def extents(gaussians: Gaussians) -> dict[str, Any]:
 def coverage(scene: Scene) -> list[dict[str, Any]]:
     """Measure how much of each view the Gaussians cover. If a photo has two layers, each layer is a view.
 
-    Returns three entries for each view. ``name`` is its name. ``share_of_pixels`` is the share of the pixels that have
-    a visible Gaussian of their own, or None if the scene does not have one Gaussian per pixel. ``share_of_gaussians``
-    is the share of all Gaussians whose mean is inside the picture.
+    Returns three entries for each view. ``name`` is the view's name. ``share_of_pixels`` is the share of the pixels
+    that have a visible Gaussian of their own, or None if the scene does not have one Gaussian per pixel.
+    ``share_of_gaussians`` is the share of all Gaussians whose mean is inside the picture.
     """
     if len(scene) == 0:
         return []
@@ -62,7 +62,10 @@ def coverage(scene: Scene) -> list[dict[str, Any]]:
 
 
 def shares_inside(scene: Scene, most: int) -> list[float]:
-    """Return, for each view, the share of the Gaussians whose means are inside it. At most ``most`` are tested."""
+    """Return, for each view, the share of the Gaussians whose means are inside it.
+
+    At most ``most`` Gaussians are tested.
+    """
     rows = np.arange(0, scene.num_gaussians, max(1, -(-scene.num_gaussians // most)))
     points = scene.file_gaussians.means[rows].astype(np.float64)
     return [float(inside.mean()) if len(points) else 0.0 for inside in inside_views(points, scene.cameras)]

@@ -92,7 +92,10 @@ def change_exposure(setup: StressScene, share: float) -> StressScene:
 
 
 def break_rows(setup: StressScene) -> StressScene:
-    """Remove 1 % of the rows at random, but at least one. The reader removes rows with NaN in the same manner."""
+    """Remove 1 % of the rows at random, but at least one.
+
+    Scenes can lack rows, because the reader of files removes rows with NaN.
+    """
     count = len(setup.scene.gaussians)
     broken_share = 0.01  # share of the rows that are removed
     broken = np.random.default_rng(SEED).choice(count, max(1, round(broken_share * count)), replace=False)

@@ -158,7 +158,7 @@ class CompactOptions(Settings):
         return [*self.whole_only, *self.blocks.asked]
 
     def changed(self, names: Iterable[str]) -> list[str]:
-        """Return those of the ``names`` whose settings differ from their defaults; they are flat names."""
+        """Return those of the ``names`` whose settings differ from their defaults; all names are flat."""
         values, declared = self.to_dict(), flat_settings(CompactOptions)
         return [name for name in names if values[name] != declared[name].default]
 

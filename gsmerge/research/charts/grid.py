@@ -42,7 +42,7 @@ def parse_grid(pairs: Sequence[str]) -> SettingGrid:
 
 
 def parse_grid_value(text: str) -> Any:
-    """Parse a number, true or false; return any other text as it is."""
+    """Parse a number, true or false; return any other text unchanged."""
     try:
         return json.loads(text)
     except ValueError:
