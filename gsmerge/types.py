@@ -417,10 +417,7 @@ class Scene(ArrayFields):
         return self.pixels is not None and self.pixels.own
 
     def get_pixels(self) -> Pixels:
-        """Return the pixels of a scene that has them, as every prepared scene does.
-
-        AssertionError for any other scene.
-        """
+        """Return the pixels, which every prepared scene has; AssertionError for a scene without pixels."""
         assert self.pixels is not None, "pixels are known"
         return self.pixels
 
