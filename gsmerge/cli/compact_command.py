@@ -207,7 +207,7 @@ def _decode(args: opt.Args, path: Path, out: Path) -> None:
 
 
 def _find_features(scenes: Sequence[Path]) -> FeatureFile | None:
-    """Return the first input that is a ``.gsm`` of Feature Gaussians; None if there is none."""
+    """Return the first input that is a ``.gsm`` of Feature Gaussians; None if no input is one."""
     from gsmerge.io.formats.table import STATE_ENDING
 
     states = [path for path in scenes if path.suffix.lower() == STATE_ENDING and path.is_file()]

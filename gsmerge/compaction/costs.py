@@ -96,7 +96,8 @@ class RunCosts:
     def end_parts(self, count: float, coarser: Sequence[float]) -> list[RunPart]:
         """Return the parts that follow after the result is built: coarser levels, a trial, and scores of the input.
 
-        ``count`` is the number of Gaussians of the result, ``coarser`` those of the levels. The trial has two rounds.
+        ``count`` is the number of Gaussians of the result, and ``coarser`` has the numbers of the coarser levels. The
+        trial has two rounds.
         """
         build = self.build_part(count)
         trial = [RunPart(TRIAL_SHARE * build.stages, TRIAL_SHARE * build.fits, 2)] * self.has_trial

@@ -84,7 +84,7 @@ def is_without_views(scene: Scene, options: CompactOptions) -> bool:
 def choose_method(options: CompactOptions, scene: Scene) -> Method:
     """Choose the method for a scene; a note lists the changed settings that the method ignores.
 
-    Raises UsageError if the scene lacks what the method needs, or if a program that it runs is missing.
+    Raises UsageError if the scene lacks what the method needs, or if a program that the method runs is missing.
     """
     if is_without_views(scene, options):
         kinds = (PrepareOptions, SegmentOptions, MatchOptions, DecodeOptions)  # settings that act on views

@@ -76,8 +76,8 @@ class Trial:
 
         ``own_before`` and ``own_after`` are the PSNR (dB) of the result's own photos, rendered from the input and from
         the result. ``confirmed`` is the share of the pixels whose depth other views confirm. New views gain at most
-        this share of what own photos gain. The input is assumed to show new views worse than its own views, by the same
-        difference as in the trial.
+        this share of what own photos gain. The input is assumed to show new views worse than its own views, by as much
+        as in the trial.
         """
         most_gain = confirmed * max(0.0, own_after - own_before)
         least_gain = min(self.after - self.before, most_gain)

@@ -62,7 +62,7 @@ def coverage(scene: Scene) -> list[dict[str, Any]]:
 
 
 def shares_inside(scene: Scene, most: int) -> list[float]:
-    """Return, for each view, the share of the Gaussians whose means are inside it.
+    """Return, for each view, the share of the Gaussians whose means are inside the view.
 
     At most ``most`` Gaussians are tested.
     """

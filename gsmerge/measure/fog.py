@@ -183,8 +183,8 @@ def mean_fog(sums: np.ndarray) -> Fog:
     """Make the figures of a :class:`Fog` from ``sums [pictures,6,2]`` of several pictures.
 
     A picture has the four rows of :func:`sum_pixels`, and the two rows of :func:`count_spikes`. A figure is the sum
-    over all pictures, divided by the number of their pixels. For veils, each picture's sum is divided by the picture's
-    pixels, and the shares are then averaged.
+    over all pictures, divided by the number of these pictures' pixels. For veils, each picture's sum is divided by the
+    picture's pixels, and the shares are then averaged.
     """
     near, far, holes, _, *spikes = (total / count if count else None for total, count in sums.sum(0).tolist())
     veils = [total / count for total, count in sums[:, 3].tolist() if count]

@@ -141,7 +141,7 @@ def _closer_or_farther(gain: float) -> str:
 
 
 def agreement_words(data: ViewData) -> str:
-    """Describe the share of the depth that other views confirm, or say what would help if the share is small."""
+    """Describe the share of the depth that other views confirm, or say what would raise a small share."""
     if data.agreement is None:
         return ""
     return data.agreement.advice or f"{100 * data.agreement.confirmed:.0f} % of the depth is confirmed by other views"

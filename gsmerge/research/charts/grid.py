@@ -29,7 +29,7 @@ GridRun = tuple[ChartScene, RunRecord, CompactOptions]  # scene, record without 
 def parse_grid(pairs: Sequence[str]) -> SettingGrid:
     """Make a grid from pairs NAME=A,B with names of settings of compact.
 
-    Raises UsageError if a name is unknown or given twice, or if a pair has no values.
+    Raises UsageError if the name of a setting is unknown or given twice, or if a pair has no values.
     """
     grid: dict[str, list[Any]] = {}
     for pair in pairs:

@@ -217,7 +217,7 @@ def keep_common(scenes_of: Mapping[K, set[str]]) -> dict[K, set[str]]:
 
     ``scenes_of`` are the measured scenes of each point. First, points with less than ``MIN_SHARE`` of all scenes are
     left out, so that failed runs of one setting do not remove scenes of the others. If the remaining points have no
-    scene in common, each keeps its own scenes.
+    scene in common, each point keeps its own scenes.
     """
     fewest = MIN_SHARE * len(set().union(*scenes_of.values()))
     kept = {point: scenes for point, scenes in scenes_of.items() if len(scenes) >= fewest}
