@@ -1,7 +1,7 @@
 """Exceptions for problems that a user can fix, each with its exit code.
 
 Invalid arguments of the Python API raise ``ValueError``. Problems with files and their content raise one of these
-exceptions; the command line prints its message as one line.
+exceptions; the command line prints the message of an exception as one line.
 """
 
 from __future__ import annotations
@@ -46,7 +46,8 @@ class SceneError(GsmergeError):
     exit_code = 3
 
     def __init__(self, path: str | PathLike[str], problem: str, remedy: str = "") -> None:
-        # Messages of libraries may have several lines. Views without names are called "view 0", which may double "view"
+        # Messages of libraries may have several lines. Views without names are called "view 0", so that a message with
+        # "view NAME" has the word "view" twice
         problem = " ".join(problem.split()).replace("view view ", "view ")
         self.path, self.problem, self.remedy = str(path), problem, remedy
         super().__init__(f"{self.path}: {problem}" + (f"; {remedy}" if remedy else ""))
@@ -68,7 +69,7 @@ class DoubtWarning(UserWarning):
 class Doubt(str):
     """A note for the user that the result may be poor or wrong; any other note is a plain text.
 
-    Commands show it as a warning, and fail with ``--strict``; Python gives a :class:`gsmerge.DoubtWarning`.
+    Commands show a doubt as a warning, and fail with ``--strict``; Python gives a :class:`gsmerge.DoubtWarning`.
     """
 
 

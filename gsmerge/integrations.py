@@ -42,7 +42,8 @@ def depth_anything_3(prediction: Any, *, sh_degree: int = 0) -> dict[str, Any]:
     return {
         **_convert_gaussians(gaussians, sh_degree),
         "scales": _unbatch("scales", gaussians.scales, 2),
-        # The model makes z positive, as if it were w. These are the same rotations with positive w
+        # The model makes z positive, as if it were w. Quaternions with negative w are negated here, which keeps the
+        # rotations
         "quats": rotations * (1 - 2 * (rotations[:, :1] < 0)),
         "images": _as_floats(photos),
         "viewmats": viewmats,
@@ -110,7 +111,7 @@ def ffgs(output: Any, images: Array | None = None, cameras: Any = None, *, sh_de
             ``[1,n,k,3]``, or RGB ``[1,n,3]`` if its ``sh_degree`` is None) and ``cameras``, which may be None.
         images: ``[1,V,3,H,W]`` of the cameras' views, in [0, 1], at the model's input size; None: no photos.
         cameras: The library's ``Cameras`` in the frame of the output, such as ``views.cameras`` for
-            ``output.to_world()``; None: those of the output, if it has any.
+            ``output.to_world()``; None: the cameras of the output, if the output has any.
         sh_degree: Harmonics above this degree are left out.
 
     Raises:
@@ -165,7 +166,10 @@ def _unwrap(name: str, values: Any) -> Any:
 
 
 def _get(owner_name: str, owner: Any, name: str) -> Any:
-    """Return a field of an object, or an entry of a mapping, by its name; SceneError if it is missing or None."""
+    """Return a field of an object, or an entry of a mapping, by its name.
+
+    Raises SceneError if the field or entry is missing or None.
+    """
     value = owner.get(name) if isinstance(owner, Mapping) else getattr(owner, name, None)
     if value is None:
         remedy = "run the model with infer_gs=True" if name == "gaussians" else ""
@@ -194,10 +198,10 @@ def _convert_gaussians(gaussians: Any, sh_degree: int) -> dict[str, Array]:
 def _convert_views(
     poses: Mapping[str, Array], extrinsics: str, intrinsics: str, images: Array
 ) -> dict[str, np.ndarray]:
-    """Return the arguments for the views of pixelSplat and its successors.
+    """Return the arguments for the views of pixelSplat and its successors, from entries of ``poses`` by name.
 
-    Their poses are camera to world, their intrinsics are relative to the image's size, and their images have the
-    channels first.
+    The poses of these models are camera to world, the intrinsics are relative to the image's size, and the images have
+    the channels first.
     """
     c2w = as_array(_unbatch(extrinsics, _get("poses", poses, extrinsics), 3)).astype(np.float64)
     photos = as_array(_unbatch("images", images, 4)).transpose(0, 2, 3, 1)

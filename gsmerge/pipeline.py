@@ -64,7 +64,7 @@ def merge_views(prepared: Prepared, plan: Plan, count: int | None) -> MergedView
 def encode_views(
     prepared: Prepared, plan: Plan, count: int | None
 ) -> tuple[FeatureGaussians, Members, Segmentation, Corrector]:
-    """Encode each superpixel of all views as a Feature Gaussian; return also its members and the networks in use.
+    """Encode each superpixel of all views as a Feature Gaussian; also return members, superpixels and networks.
 
     A run merges the Feature Gaussians; :mod:`gsmerge.states` keeps them in a file to which views can be added.
     """
@@ -86,7 +86,7 @@ def fit(start: Decoded, prepared: Prepared, plan: Plan) -> Fitted:
 
 
 def prune_and_fill(fitted: Fitted, start: Decoded, prepared: Prepared, plan: Plan) -> Fitted:
-    """Drop the Gaussians that no view sees, and put new ones into gaps between the views, at most as many.
+    """Drop the Gaussians that no view sees, and fill gaps between the views with at most as many new Gaussians.
 
     Gaps are filled only after a long fit that was accepted, and not if parts of the scene may be empty, as after a
     crop. If the plan has to fill the budget, or drops nothing, only as many unseen Gaussians are dropped as new ones

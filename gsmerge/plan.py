@@ -1,7 +1,7 @@
 """The plan of a run: the one place that reads "auto", effort, budget, recipe and checkpoint names.
 
 Every choice is a function here. :func:`make_plan` makes all choices for a prepared scene or block.
-:func:`choose_for_scene` makes those that need no computation. Estimates and scenes in blocks need only these. Each
+:func:`choose_for_scene` makes only the choices that need no computation, which estimates and scenes in blocks use. Each
 stage gets its own part of the plan, and no stage knows the options of another.
 """
 
@@ -134,7 +134,7 @@ class Plan:
     def weakens(self) -> bool:
         """Return whether a group starts with less opacity if other views see surfaces behind it.
 
-        This may leave holes, which a long fit closes.
+        The lower opacity may leave holes, which a long fit closes.
         """
         return self.superpixels.start_share < 1 and self.checkpoint is None
 
@@ -153,7 +153,7 @@ class Plan:
         return replace(self, fit=replace(self.fit, move_cameras=False))
 
     def with_fit(self, fit: FitOptions) -> Plan:
-        """Return the plan with another fit, which starts with all Gaussians."""
+        """Return the plan with the fit ``fit``, which starts with all Gaussians."""
         return replace(self, fit=fit, superpixels=replace(self.superpixels, start_share=1.0))
 
 
@@ -190,7 +190,7 @@ def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoin
 
 
 def _fill_options(prepared: Prepared, options: CompactOptions) -> FilledOptions:
-    """Fill in the settings that the options leave to the scene; notes say why they have their values."""
+    """Fill in the settings that the options leave to the scene; notes say why these settings have their values."""
     size, agreement = prepared.size, prepared.agreement
     filled = resolve_budget(size, options, agreement)
     segment = _resolve_superpixels(filled.segment, agreement, EFFORTS[options.effort])
@@ -255,7 +255,7 @@ def cuts_views(options: CompactOptions, size: SceneSize) -> bool:
 class SceneChoices:
     """Decisions about a whole scene that follow from its size and the options, without computation.
 
-    A run, its estimate and its blocks use the same ones.
+    A run, the estimate of the run and the blocks of the run use the same choices.
     """
 
     decode: DecodeOptions  # Gaussians per group
@@ -277,7 +277,7 @@ def choose_for_scene(
     """Make the decisions that follow from the scene's size and the options; UsageError for impossible options.
 
     ``num_input``: see :func:`gsmerge.facts.counts.count_limits`. ``keeps``: what :func:`keeps_fidelity` has returned
-    for the options of the caller; None: it is called for these ``options``.
+    for the options of the caller; None: what this function returns for ``options``.
     """
     keeps = keeps_fidelity(scene, options) if keeps is None else keeps
     if scene.num_views == 0 and options.fit.fit_steps is None and not EFFORTS[options.effort].fits_alone:
@@ -294,15 +294,18 @@ def choose_for_scene(
     match = options.match.match or ("overlap" if EFFORTS[options.effort].merges else "none")
     networks = choose_networks(options, scene)
     # Views are cut into superpixels if they have pictures other than renders, or if a setting changes superpixels. A
-    # setting of their number does not count, because it only says how many Gaussians there are. Otherwise neighbouring
-    # Gaussians are merged pair by pair
+    # setting of the number of superpixels does not count, because it only says how many Gaussians there are. Without
+    # superpixels, neighbouring Gaussians are merged pair by pair
     cuts = scene.num_views > 0 and (not scene.rendered or options.changes_superpixels)
     may_merge_pairs = options.method == OURS and networks == "none" and not cuts
     return SceneChoices(decode, limits, match, networks, fit, keeps, may_merge_pairs)
 
 
 def choose_blocks(scene: SceneSize, options: CompactOptions) -> int:
-    """Return the number of blocks for a scene; UsageError if it cannot be cut into the number that was asked for."""
+    """Return the number of blocks for a scene.
+
+    Raises UsageError if the scene cannot be cut into the number that was asked for.
+    """
     shared = [] if scene.has_own_pixels else ["a scene whose views have no Gaussians of their own"]
     problems = [*options.uncut, *shared]
     count = wanted_blocks(options, scene.num_gaussians, scene.num_views)
@@ -318,7 +321,10 @@ def choose_blocks(scene: SceneSize, options: CompactOptions) -> int:
 
 
 def usual_blocks(num_gaussians: int, num_views: int) -> int:
-    """Return the number of blocks that a scene has by default; if only its views are many, at most this number."""
+    """Return the number of blocks that a scene has by default.
+
+    A scene of which only the views are many has at most this number.
+    """
     if num_gaussians > WHOLE_GAUSSIANS:
         return -(-num_gaussians // BLOCK_GAUSSIANS)
     return 1 if num_views <= WHOLE_VIEWS else -(-num_views // BLOCK_VIEWS)
@@ -327,7 +333,7 @@ def usual_blocks(num_gaussians: int, num_views: int) -> int:
 def wanted_blocks(options: CompactOptions, num_gaussians: int, num_views: int = 0) -> int:
     """Return the largest number of blocks that a run may have by its options; 1 for a run in one piece.
 
-    ``num_views`` only matters if there are many.
+    ``num_views`` only matters if it is large.
     """
     blocks = options.blocks.blocks
     if blocks == "auto":
@@ -338,11 +344,11 @@ def wanted_blocks(options: CompactOptions, num_gaussians: int, num_views: int = 
 def keeps_fidelity(scene: SceneSize, options: CompactOptions) -> bool:
     """Return whether the run searches for the fewest Gaussians that keep the quality of the input.
 
-    It does if the options do not decide the number, and the scene has no photos or few Gaussians per pixel. With few
-    Gaussians per pixel, no usual share of them is right: a scene that is compact already needs most of them, and a
-    scene of many small ones only a few. Without photos the PSNR of the result against the input has to be
-    ``FIDELITY_PSNR``. With photos the result may show them ``FIDELITY_LOSS`` worse than the input. Measurements are in
-    docs/internals/notebook.md.
+    The run searches if the options do not decide the number, and the scene has no photos or few Gaussians per pixel.
+    With few Gaussians per pixel, no usual share of the Gaussians is right: a scene that is compact already needs most
+    of its Gaussians, and a scene of many small Gaussians needs only a few. Without photos the PSNR of the result
+    against the input has to be ``FIDELITY_PSNR``. With photos the result may show the photos ``FIDELITY_LOSS`` worse
+    than the input. Measurements are in docs/internals/notebook.md.
     """
     # with half a Gaussian per pixel or more, the usual share of them is enough to show the photos
     is_dense = scene.has_own_pixels or scene.num_gaussians >= 0.5 * scene.num_views * scene.pixels_per_view > 0
@@ -374,7 +380,7 @@ def choose_networks(options: CompactOptions, size: SceneSize) -> str:
 
 
 def load_networks(options: CompactOptions, size: SceneSize) -> Checkpoint | None:
-    """Load the networks that a run uses; None if it uses none.
+    """Load the networks that a run uses; None if a run uses no networks.
 
     Raises SceneError if networks are required and cannot be used, and UsageError if they do not fit the options.
     """
@@ -416,8 +422,8 @@ def check_networks(checkpoint: Checkpoint, options: CompactOptions) -> None:
 def resolve_budget(size: SceneSize, options: CompactOptions, agreement: Agreement | None) -> CompactOptions:
     """Fill in the number of Gaussians beyond which new views gain nothing, with a note.
 
-    This number is larger the more the views confirm each other's depth. It is the budget if the options say "auto", and
-    an upper limit for a budget that is a share, a size or a device.
+    The more the views confirm each other's depth, the larger is this number of Gaussians. The number is the budget if
+    the options say "auto", and an upper limit for a budget that is a share, a size or a device.
     """
     budget = options.budget
     is_limit = budget.is_limit and options.method == OURS
@@ -457,7 +463,7 @@ def _resolve_superpixels(options: SegmentOptions, agreement: Agreement | None, e
 
 
 def _resolve_clean(options: CleanOptions, prepared: Prepared) -> CleanOptions:
-    """Drop no sky if no photo shows where it is, and add a note."""
+    """Drop no sky if no photo shows where the sky is, and add a note."""
     if "sky" not in options.drops or prepared.reference.name != RENDERS:
         return options
     note("drop sky: no photo that is used shows where the sky is, so it is kept")
@@ -466,7 +472,7 @@ def _resolve_clean(options: CleanOptions, prepared: Prepared) -> CleanOptions:
 
 
 def resolve_decode(options: CompactOptions, scene: SceneSize) -> DecodeOptions:
-    """Choose K if it is "auto": 4 if all views have the same camera and no long fit follows, otherwise 1.
+    """Choose K if the option is "auto": 4 if all views have the same camera and no long fit follows, otherwise 1.
 
     A single view has too few Gaussians with K = 1, because superpixels are only 4.4 % of its pixels. With several
     cameras, each surface gets Gaussians from several views.
@@ -493,8 +499,8 @@ def resolve_fit(options: CompactOptions) -> FitOptions:
 def steps_for(options: CompactOptions, num_views: int, share: float = USUAL_SHARE) -> int:
     """Return the number of steps of the full fit.
 
-    It follows from effort, number of views and ``share``, unless the options have it. ``share``: Gaussians of the
-    result for each pixel. A step draws one view. Measurements are in docs/internals/large-scenes.md.
+    The number follows from effort, number of views and ``share``, unless the options state the number. ``share``:
+    Gaussians of the result for each pixel. A step draws one view. Measurements are in docs/internals/large-scenes.md.
     """
     if options.fit.fit_steps is not None:
         return options.fit.fit_steps
@@ -507,8 +513,8 @@ def steps_for(options: CompactOptions, num_views: int, share: float = USUAL_SHAR
 def _fit_photos(prepared: Prepared, options: CompactOptions, fit: FitOptions) -> FitOptions:
     """Fill in the settings of the fit that depend on other options and on the scene.
 
-    They are the scale of the photos, and whether the fit moves cameras, fills the budget, and keeps Gaussians beyond
-    all views.
+    These settings are the scale of the photos, and whether the fit moves cameras, fills the budget, and keeps Gaussians
+    beyond all views.
     """
     scene = prepared.scene
     fit = replace(fit, beyond=options.prepare.extent == "beyond", fills=options.budget.is_filled)
@@ -537,8 +543,8 @@ def _fit_renders(prepared: Prepared, options: CompactOptions, fit: FitOptions) -
 def _choose_scored_views(prepared: Prepared, effort: Effort | None) -> tuple[int, ...]:
     """Choose the views that score input and result, among those whose pictures show the scene.
 
-    ``effort`` decides how many views the report needs. None: the views decide the number of Gaussians, which takes
-    more of them.
+    ``effort`` decides how many views the report needs. None: the views decide the number of Gaussians, which takes more
+    views than a report.
     """
     own = own_views(prepared)
     if prepared.reference.placed:
@@ -550,7 +556,7 @@ def _choose_scored_views(prepared: Prepared, effort: Effort | None) -> tuple[int
 def own_views(prepared: Prepared) -> tuple[int, ...]:
     """Return the views whose pictures show the scene: views that were placed, or views of the input.
 
-    The latter are numbered as in the input, where a view may be repeated.
+    Views of the input are numbered as in the input, where a view may be repeated.
     """
     if not prepared.reference.of_views:
         return prepared.reference.score_views

@@ -195,7 +195,7 @@ NO_CAMERAS = Cameras(np.empty((0, 4, 4)), np.empty((0, 3, 3)), 1, 1)
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LargePhotos(ArrayFields):
-    """Photos larger than the scene's views, read one at a time; they have the poses of the scene's cameras."""
+    """Photos larger than the scene's views, read one at a time; the photos have the poses of the scene's cameras."""
 
     Ks: np.ndarray  # [v,3,3] intrinsics at the size of the photos
     width: int
@@ -257,7 +257,7 @@ class Pixels(ArrayFields):
     Pixels are numbered over all views, ``(v·H + y)·W + x``.
 
     Args:
-        homes: ``[n]`` int, the pixel in which each Gaussian is most visible; -1 if no view sees it.
+        homes: ``[n]`` int, the pixel in which each Gaussian is most visible; -1 if no view sees the Gaussian.
         fronts: ``[v,h,w]`` int32, the front Gaussian of each pixel; -1 for none.
         own: Each view has Gaussians of its own, one or more for a pixel, with the colours of its photo.
     """
@@ -315,7 +315,7 @@ class Pixels(ArrayFields):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Region(ArrayFields):
-    """A box, which may be rotated, or a sphere. Both are convex, so the mean of points inside them is also inside."""
+    """A box, which may be rotated, or a sphere. Regions are convex: the mean of points inside is also inside."""
 
     middle: np.ndarray  # [3]
     half: np.ndarray  # [3] half of each side of a box; three times the same radius for a sphere
@@ -330,7 +330,7 @@ def number_views(count: int) -> tuple[str, ...]:
 
 
 def _check_count(what: str, values: Sequence[Any], count: int) -> None:
-    """Raise ValueError unless there are ``count`` values; ``what`` names them in the message."""
+    """Raise ValueError unless there are ``count`` values; ``what`` names the values in the message."""
     if len(values) != count:
         raise ValueError(f"expected {count} {what}, got {len(values)}")
 
@@ -348,10 +348,11 @@ class Scene(ArrayFields):
         images: ``[v,h,w,3]`` photos, sRGB in [0, 1], float32; None: no photos. A run also accepts uint8.
         pixels: The pixel of each Gaussian, and the Gaussian in front of each pixel; None: not known yet.
         names: The views' names, which are the image file names if these are known; None: numbers.
-        large_photos: The photos at a size with more pixels than the views; None: they have no more pixels.
+        large_photos: The photos at a size with more pixels than the views; None: the photos have no more pixels.
         masks: ``[v,h,w]`` bool, True where a photo counts; None: everywhere. All False for a view without a photo.
         importance: ``[v,h,w]`` float32, how many pixels each pixel counts for in a fit; None: one each.
-        filled: ``[n]`` bool, True for Gaussians that are not in the file, and were added to fill holes; None: no such.
+        filled: ``[n]`` bool, True for Gaussians that are not in the file, and were added to fill holes; None: no
+            Gaussians were added.
         region: The scene has no Gaussians outside of this region, as after a crop; None: no limit.
         notes: Notes from reading the files, for the report of a run; some are doubts.
 
@@ -416,15 +417,15 @@ class Scene(ArrayFields):
         return self.pixels is not None and self.pixels.own
 
     def get_pixels(self) -> Pixels:
-        """Return the pixels of a scene that has them, as every prepared scene does; AssertionError for another one."""
+        """Return the pixels, which every prepared scene has; AssertionError for a scene without pixels."""
         assert self.pixels is not None, "pixels are known"
         return self.pixels
 
     @property
     def covered(self) -> np.ndarray | None:
-        """Mask ``[v,h,w]`` of the pixels for which the file has a Gaussian; None if it has one for all pixels.
+        """Mask ``[v,h,w]`` of the pixels for which the file has a Gaussian.
 
-        None also if views have no Gaussians of their own.
+        None if the file has a Gaussian for every pixel, or if views have no Gaussians of their own.
         """
         if self.pixels is None or not self.pixels.own or (self.filled is None and self.pixels.shown.all()):
             return None
@@ -453,7 +454,7 @@ class Scene(ArrayFields):
 
     @property
     def num_gaussians(self) -> int:
-        """Number of Gaussians of the file; budgets and ratios refer to it."""
+        """Number of Gaussians of the file; budgets and ratios refer to this number."""
         return len(self.gaussians) - (0 if self.filled is None else int(self.filled.sum()))
 
     @property
@@ -495,7 +496,7 @@ class PicturedScene(Scene):
     """A scene in which every view has a picture: its photo or, without photos, colours or renders of its Gaussians.
 
     ``empty [v,h,w]`` marks the pixels in which the scene may show nothing, by a mask or a share of each pixel. Pictures
-    are black there, and these pixels do not count for scores. None: no pixel.
+    are black in these pixels, and scores leave them out. None: no pixel.
     """
 
     images: np.ndarray
@@ -548,9 +549,9 @@ class FeatureGaussians:
     """g Gaussians that each represent a group of members, with facts about the group for later stages.
 
     Columns that describe a group are sums over its members (weights, masses, extinctions), or means with these weights.
-    Feature Gaussians are merged by the same sums and means. The opacity is computed when they are decoded, as
-    ``1 - exp(-gain * extinction / disc area)``, because blending conserves the integrated optical depth. In training,
-    columns that networks change are tensors.
+    Feature Gaussians are merged by the same sums and means. The opacity is computed when Feature Gaussians are decoded,
+    as ``1 - exp(-gain * extinction / disc area)``, because blending conserves the integrated optical depth. In
+    training, columns that networks change are tensors.
     """
 
     means: Array  # [g,3] float32

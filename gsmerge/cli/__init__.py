@@ -48,8 +48,8 @@ def main(args: Sequence[str] | None = None) -> int:
 def _open_streams() -> None:
     """Make sure that stdout and stderr exist and accept any character, since file names may contain any.
 
-    If the caller closed descriptor 0, 1 or 2, it becomes the null device. Otherwise the next file to be opened would
-    get its number, and what a process of a batch prints would go into that file.
+    If the caller closed descriptor 0, 1 or 2, it becomes the null device. If the descriptor stayed closed, the next
+    file to be opened would get its number, and what a process of a batch prints would go into that file.
     """
     for descriptor in range(3):
         try:
@@ -80,7 +80,8 @@ def program() -> NoReturn:
     if signal.getsignal(signal.SIGINT) == signal.default_int_handler:
         signal.signal(signal.SIGINT, stop_at_once)
     if os.name != "nt" and os.environ.get("TERM", "") in ("dumb", "unknown", "") and not os.environ.get("FORCE_COLOR"):
-        # Rich assumes that such a terminal has 80 by 25 letters, and that one without a name knows escape sequences
+        # Rich assumes that a dumb or unknown terminal has 80 by 25 letters, and that a terminal without a name knows
+        # escape sequences
         os.environ |= dict(zip(("COLUMNS", "LINES"), map(str, shutil.get_terminal_size()), strict=True), TERM="dumb")
     code = main()
     atexit._run_exitfuncs()

@@ -92,7 +92,7 @@ def make_command(only: str | None = None) -> Any:
     """Make the Click command that parses the words of the command line and runs a command; ``only``: see `make_app`.
 
     Typer's option that installs completion is removed, because it changes files of the user's shell. The option that
-    prints the completion stays.
+    prints the shell's completion stays.
     """
     command = typer.main.get_command(make_app(only))
     command.params = [param for param in command.params if param.name != "install_completion"]
@@ -159,8 +159,8 @@ def root(
 def _orderly_stop(signals: list[signal.Signals]) -> Iterator[None]:
     """Let SIGTERM and SIGHUP end the block as Ctrl-C does, without unfinished files.
 
-    Each such signal is added to ``signals``. Signals that the caller handles or ignores, as under nohup, keep their
-    handlers.
+    Each signal that arrives is added to ``signals``. Signals that the caller handles or ignores, as under nohup, keep
+    their handlers.
     """
     default_handlers = {signal.SIGINT: signal.default_int_handler}
     default_handlers |= {  # Windows has no SIGHUP
@@ -250,7 +250,7 @@ def run(args: Sequence[str] | None = None) -> int:
         return end_by_signal() if code == INTERRUPTED else code  # Typer turns Ctrl-C into this code
     except (KeyboardInterrupt, typer.Abort) as error:
         if isinstance(error.__cause__, EOFError) and not signals:
-            # Typer takes it for the end of user input, which no command reads
+            # Typer takes an EOFError for the end of user input, which no command reads
             return end_with("unexpected error: EOFError; run again with --debug", 1)
         return end_by_signal()
     except BrokenPipeError:

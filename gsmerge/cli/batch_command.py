@@ -153,7 +153,7 @@ def _run_jobs(args: opt.Args, jobs: Sequence[Job], options: BatchOptions, totals
 
 
 def check_failures(failed: Sequence[tuple[str, str]], total: int, unit: str, *, listed: bool = False) -> None:
-    """Raise BatchError if jobs ``failed`` (name, reason).
+    """Raise BatchError if jobs ``failed`` (name, reason), of ``total`` jobs that messages count as ``unit``.
 
     The message has the first reason, unless all reasons have been ``listed`` already.
     """
@@ -164,7 +164,7 @@ def check_failures(failed: Sequence[tuple[str, str]], total: int, unit: str, *, 
 def _first_reason(reasons: Sequence[tuple[str, str]], *, listed: bool) -> str:
     """Return the end of a message: the first scene and its reason.
 
-    Empty if there is none, or if all reasons have been ``listed`` already.
+    The end is empty if there is no reason, or if all reasons have been ``listed`` already.
     """
     return "" if listed or not reasons else "; the first: {}: {}".format(*reasons[0])
 

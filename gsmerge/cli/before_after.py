@@ -24,7 +24,7 @@ def lpips_networks(
 ) -> tuple[tuple[str, ...], list[str]]:
     """Return the LPIPS networks to measure with, by ``--lpips``, and a note if there is none.
 
-    By default they are those of the ``usual`` networks that are installed.
+    By default the ``usual`` networks are measured with, as far as they are installed.
     """
     from gsmerge.measure.lpips import INSTALL, lpips_available
 
@@ -64,7 +64,7 @@ class BeforeAfter:
 def read_before_after(args: Args, files: SceneFiles) -> BeforeAfter:
     """Read a scene, its compact versions, and the held-out views of ``--targets``.
 
-    ``files`` are those of the scene. If it has no views, some are placed.
+    ``files`` are those of the scene. If the scene has no views, some views are placed.
     """
     from gsmerge.facts.place_cameras import NO_VIEWS, PLACED_VIEWS, add_views
     from gsmerge.io import read_gaussians
@@ -94,7 +94,7 @@ def read_before_after(args: Args, files: SceneFiles) -> BeforeAfter:
 def own_cameras(paths: Sequence[Path], scene: Scene) -> tuple[dict[str, Cameras], list[str]]:
     """Return the cameras of results whose fit moved the cameras of the scene, by name of the result, and notes.
 
-    They are read from the result, or from the file beside it.
+    The cameras are read from the file of the result, or from the file of cameras beside it.
     """
     import numpy as np
 
@@ -162,7 +162,7 @@ def held_out_views(
 def file_names(paths: Sequence[Path]) -> list[str]:
     """Return a unique name of each file; UsageError for a repeated file.
 
-    It is the file name if all file names differ, otherwise the path.
+    The names are the file names if all file names differ, otherwise the paths.
     """
     if len(set(paths)) < len(paths):
         raise UsageError(f"expected every result once, got {max(paths, key=paths.count)} twice")

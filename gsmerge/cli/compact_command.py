@@ -152,7 +152,7 @@ def _check_outputs(args: opt.Args, files: SceneFiles, settings: CompactOptions, 
     num_files = settings.budget.levels if outputs.format.levels == "apart" else 1
     levels = [level_output(outputs.result, level) for level in range(1, num_files)]
     networks = [] if settings.checkpoint in CHECKPOINTS else [Path(settings.checkpoint)]
-    # Results in several formats share a camera file, so it may exist unless it is to be replaced
+    # Results in several formats share a camera file, which may exist already, unless --overwrite replaces it
     replaced_cameras = outputs.viewer_cameras if args.overwrite else None
     paths = (*outputs.paths, *levels, replaced_cameras)
     check_outputs(paths, (*input_files(files), *networks), overwrite=args.overwrite or args.dry_run)
@@ -215,7 +215,7 @@ def _decode(args: opt.Args, path: Path, out: Path) -> None:
 
 
 def _find_features(scenes: Sequence[Path]) -> FeatureFile | None:
-    """Return the first input that is a ``.gsm`` of Feature Gaussians; None if there is none."""
+    """Return the first input that is a ``.gsm`` of Feature Gaussians; None if no input is one."""
     from gsmerge.io.formats.table import STATE_ENDING
 
     states = [path for path in scenes if path.suffix.lower() == STATE_ENDING and path.is_file()]
@@ -229,7 +229,7 @@ def _find_features(scenes: Sequence[Path]) -> FeatureFile | None:
 def _check_scenes(args: opt.Args) -> None:
     """Raise UsageError if several scenes cannot be joined.
 
-    They cannot if ``--cameras`` names one file for all, or if a scene is missing, given twice, or a result.
+    Scenes cannot be joined if ``--cameras`` names one file for all, or if a scene is missing, given twice, or a result.
     """
     if len(args.scenes) == 1:
         return

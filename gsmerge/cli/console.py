@@ -51,7 +51,7 @@ class JsonLines:
     def seconds_left(self) -> float | None:
         """Seconds until the run ends, if it goes on as fast as since the share was first known.
 
-        None if the share is not known, or has not grown since.
+        None if the share is not known, or has not grown since it was first known.
         """
         if self.share == 1:
             return 0.0
@@ -80,7 +80,7 @@ def say(message: str, *, kind: Kind = "info", quiet: bool = False) -> None:
     """Print a message as one line on stderr unless ``quiet``; a closed stderr is ignored.
 
     Notes, warnings and errors begin with their kind. A terminal wraps the line between words. With ``--progress json``
-    the line is a JSON object, whose key is the kind. It is printed even if ``quiet``.
+    the line is a JSON object, whose key is the kind. This object is printed even if ``quiet``.
     """
     json_lines = _json_lines.get()
     if json_lines is not None:
@@ -149,7 +149,8 @@ def _terminal(*, quiet: bool) -> Any:
     from rich.console import Console
 
     console = Console(stderr=True)
-    # On Ctrl-C the terminal prints ^C after the bar. Without room for it, ^C would wrap to a new line
+    # On Ctrl-C the terminal prints ^C after the bar. The bar leaves room for ^C, which would otherwise wrap to a new
+    # line
     console.width = max(20, console.width - len("^C") - 1)
     return console if console.is_terminal else None
 
@@ -167,7 +168,8 @@ def json_progress(lines: JsonLines | None = None) -> Iterator[None]:
 def _share_done(text: str, done: int, total: int) -> float | None:
     """Return the share of a run that is done when it reports progress; None if the share is not known.
 
-    The record of the run forecasts the share. Without a forecast, the steps of a stage give it, if they are counted.
+    The record of the run forecasts the share. Without a forecast, the share is that of the steps of the stage, if the
+    stage counts its steps.
     """
     from gsmerge.runtime.record import STAGES, current_record
 
@@ -181,7 +183,8 @@ def _share_done(text: str, done: int, total: int) -> float | None:
 def stage_progress(*, quiet: bool) -> Iterator[Progress]:
     """Show a progress bar of a run on stderr, if it is a terminal (or ``FORCE_COLOR`` is set) and not ``quiet``.
 
-    Yields a function of ``(stage, done, total)``. It shows the stage, and the time left if the run goes on as fast.
+    Yields a function of ``(stage, done, total)``. The bar shows the stage, and the time left if the run keeps its
+    speed.
     """
     json_lines, console = _json_lines.get(), _terminal(quiet=quiet)
     if json_lines is not None:

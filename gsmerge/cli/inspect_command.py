@@ -16,7 +16,7 @@ from gsmerge.errors import SceneError, UsageError, name_notes
     opt.READING,
 )  # fmt: skip
 def inspect(args: opt.Args) -> None:
-    """Check and describe files, and say what compact would make of each scene, or why it refuses it."""
+    """Check and describe files, and say what compact would make of each scene, or why compact refuses the scene."""
     from gsmerge.inspection.file_checks import holds_scene
     from gsmerge.io.formats.table import INDEX
 
@@ -30,7 +30,7 @@ def inspect(args: opt.Args) -> None:
 
 
 def _inspect_scene(args: opt.Args, path: Path) -> None:
-    """Describe a scene in detail; SceneError if ``compact`` refuses it."""
+    """Describe a scene in detail; SceneError if ``compact`` refuses the scene."""
     from gsmerge.inspection.file_checks import check_content
     from gsmerge.inspection.inspect import inspect as inspect_scene
     from gsmerge.inspection.inspect import inspection_lines

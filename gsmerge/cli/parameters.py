@@ -1,9 +1,9 @@
 """Declare the options of the command line, each once, and turn their values into settings.
 
-A command is a function of one :class:`Args`. The decorator :func:`command` lists its parameters for Typer: names of
-options that are declared here, and declarations that only this command has. An option for a setting of the library has
-the setting's name and no default. The setting gives its help, its values and the default that the help shows
-(:func:`setting_option`).
+A command is a function of one :class:`Args`. The decorator :func:`command` lists the parameters of a command for Typer:
+names of options that are declared here, and declarations that only this command has. An option for a setting of the
+library has the setting's name and no default. The setting gives its help, its values and the default that the help
+shows (:func:`setting_option`).
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ class Args(SimpleNamespace):
     def values(self, *kinds: type, without: Collection[str] = ()) -> dict[str, Any]:
         """Return the values that the user gave for settings of the classes ``kinds``, by flat name.
 
-        Options, ``--set`` and the environment give them. The settings ``without`` are left out.
+        The values come from options, ``--set`` and the environment. Settings named in ``without`` are left out.
         """
         settings = {name: declared for name, declared in listed_settings(kinds).items() if name not in without}
         options = self.get_given(settings)
@@ -117,7 +117,7 @@ class Args(SimpleNamespace):
 
     @property
     def opacity(self) -> OpacityChoice:
-        """How the file stores opacities, by ``--hint``; "auto" if no hint says it."""
+        """How the file stores opacities, by ``--hint``; "auto" if no hint says how."""
         choice: OpacityChoice = self._parse_hints().get("opacity", "auto")
         return choice
 
@@ -161,7 +161,7 @@ class Args(SimpleNamespace):
 
 
 def parse_pairs(flag: str, pairs: Iterable[str], settings: Mapping[str, Setting]) -> dict[str, Any]:
-    """Parse NAME=VALUE pairs of ``--set`` or ``--hint``; UsageError if one is wrong."""
+    """Parse NAME=VALUE pairs of ``--set`` or ``--hint``; UsageError if one is wrong, with ``flag`` in its message."""
     values: dict[str, Any] = {}
     for pair in pairs:
         name, sign, text = pair.partition("=")
@@ -250,7 +250,10 @@ class Declaration:
 def _declare(
     name: str, kind: Any, info: Any, parse: Callable[[str], Any] | None, default: Any, flags: tuple[str, ...] = ()
 ) -> Declaration:
-    """Declare an argument or option; ``kind`` is the type of its value: ``list[...]`` for several, or with None."""
+    """Declare an argument or option.
+
+    ``kind`` is the type of its value, ``list[...]`` for several values, or a union with None.
+    """
     kind = next(part for part in get_args(kind) if part is not NoneType) if isinstance(kind, UnionType) else kind
     is_list = get_origin(kind) is list
     element_kind = get_args(kind)[0] if is_list else kind
@@ -441,7 +444,7 @@ _TABLE = (
     panel(
         COUNT_GROUP,
         setting_option("k", metavar="1-8|mixed|auto"),
-        # Kept as a text, because reports and the records of batches store it so
+        # The budget is kept as a text, because reports and the records of batches store texts
         setting_option("budget", metavar="40000|2%|5MB|DEVICE|auto", parser=str),
         setting_option("quality", metavar="30dB|-0.2dB"),
         setting_option("levels", wording="1, or 3 in a lod-meta.json"),

@@ -33,7 +33,7 @@ def check_outputs(
     """Raise UsageError for an output that is an input, is given twice, or exists and may not be replaced.
 
     ``inputs``: files that are read, and folders of photos or cameras, whose photos and camera files are not replaced.
-    ``reports``: the outputs are reports. These replace reports of gsmerge, and no other files, whatever ``overwrite``
+    ``reports``: the outputs are reports. Reports replace reports of gsmerge, and no other files, whatever ``overwrite``
     is. Raises SceneError if an output cannot be written. Missing folders are not made here.
     """
     from gsmerge.io.cameras.read import find_cameras
@@ -82,7 +82,7 @@ def _check_output(output: Path, inputs: set[str], *, overwrite: bool, reports: b
 
 
 def _check_writable(folder: Path, output: Path, expected: str) -> None:
-    """Raise SceneError if a folder, or the nearest existing folder above it, cannot be written to."""
+    """Raise SceneError for ``output`` if a folder, or the nearest existing folder above it, cannot be written to."""
     try:
         nearest = next(path for path in (folder, *folder.absolute().parents) if os.path.lexists(path))
     except OSError as error:
@@ -115,7 +115,7 @@ def write_texts(texts: Mapping[Path, str | bytes], mode: int = 0o666) -> None:
 def check_folder(folder: Path, inputs: tuple[Path, ...], *, overwrite: bool) -> None:
     """Raise UsageError for an output folder that is an input, or that has files without ``overwrite``.
 
-    Raises SceneError if it cannot be written to. A missing folder is not made here.
+    Raises SceneError if the folder cannot be written to. A missing folder is not made here.
     """
     _check_writable(folder, folder, "a folder to write pictures to")
     try:

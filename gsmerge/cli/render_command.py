@@ -75,7 +75,7 @@ def render(args: opt.Args) -> None:
     if args.path is not None and parse_camera_path(args.path) is None:  # the path is a file
         inputs = (*inputs, Path(args.path))
     if args.output.suffix.lower() in (*PICTURES, *CLIPS):
-        # A picture in the folder of a scene may be replaced, unless it is one of its photos
+        # A picture in the folder of a scene may be replaced, unless it is a photo of this scene
         read = [path for path in inputs if path not in args.scenes or not path.is_dir()]
         check_outputs((args.output,), (*read, files.images), overwrite=args.overwrite)
     else:
@@ -95,9 +95,9 @@ def render(args: opt.Args) -> None:
 
 
 def _choose_kind(args: opt.Args) -> str:
-    """Return the kind of drawing, by the name of the output and the options; UsageError if these do not fit.
+    """Return the kind of drawing, by the name of the output and the options.
 
-    A clip without ``--path`` gets the path "orbit".
+    Raises UsageError if output and options do not fit each other. A clip without ``--path`` gets the path "orbit".
     """
     suffix = args.output.suffix.lower()
     is_clip, is_picture = suffix in CLIPS, suffix in PICTURES

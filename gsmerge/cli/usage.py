@@ -24,7 +24,7 @@ SYNONYMS = {
     **dict.fromkeys(("photos", "image-dir"), "images"),
     **dict.fromkeys(("poses", "colmap"), "cameras"),
 }
-# Typer does not export its usage errors; BadParameter, which it exports, derives from their common base
+# Typer does not export the base of its usage errors, but exports BadParameter, which derives from it
 UsageErrors: Any = typer.BadParameter.__mro__[2]
 
 

@@ -58,7 +58,8 @@ def start_block(
 def belongs_to_block(means: np.ndarray, block: Block, covisibility: Covisibility) -> np.ndarray:
     """Return a mask ``[n]`` of the means ``[n,3]`` whose owner is one of the block's own views.
 
-    The owner is searched among the views that share surfaces with the block, because the others do not see these means.
+    The owner is searched among the views that share surfaces with the block, because other views do not see these
+    means.
     """
     is_candidate = covisibility.weights[list(block.own)].sum(0) > 0
     is_candidate[list(block.own)] = True

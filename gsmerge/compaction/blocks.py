@@ -50,8 +50,8 @@ from gsmerge.stages.prune import split_unseen
 from gsmerge.types import Cameras, Decoded, Gaussians, Scene
 
 T = TypeVar("T")
-# A block may have more superpixels than its views would have in one piece, if views of other blocks also see its
-# surfaces (see count_factors). It has at most this many times as many
+# A block may have more superpixels than its views would have in one piece, if views of other blocks also see the
+# block's surfaces (see count_factors). The block has at most MOST_DENSITY times as many superpixels as in one piece
 MOST_DENSITY = 2.0
 BLOCK_SURPLUS = 1.03  # Gaussians of all blocks, relative to the requested number; the faintest are dropped at the end
 
@@ -60,7 +60,7 @@ def cut_views(scene: Scene, options: CompactOptions, count: int) -> tuple[list[B
     """Cut the views of a scene into ``count`` blocks; also return what each view sees of the others.
 
     If the user asks for blocks, or the memory is too small for one piece, there are ``count`` blocks. If only the views
-    are many, there may be fewer, down to one.
+    are many, there may be fewer blocks, down to one.
     """
     with stage("partition"):
         covisibility = measure_covisibility(scene.numpy())
@@ -74,9 +74,10 @@ def compact_in_blocks(
 ) -> CompactResult:
     """Compact a scene in blocks of views.
 
-    First the views of each block are merged, and each block keeps the Gaussians that belong to it. All blocks together
-    then have one set of Gaussians. Each block fits those that its views see, including Gaussians of its neighbours, and
-    keeps its own. At the border of two blocks, both fit the same Gaussians to the same photos.
+    First the views of each block are merged, and each block keeps the Gaussians that belong to it. The sets of all
+    blocks are joined into one set of Gaussians. Each block fits the Gaussians that its views see, including Gaussians
+    of its neighbours, and keeps its own Gaussians. At the border of two blocks, both fit the same Gaussians to the same
+    photos.
     """
     device, scene = scene.gaussians.device, scene.numpy()
     count, limit = len(blocks), choices.limits.count
@@ -126,7 +127,7 @@ def compact_in_blocks(
 
 
 def join_parts(parts: Sequence[Gaussians]) -> tuple[Gaussians, np.ndarray]:
-    """Join the Gaussians of all blocks; also return the number ``[n]`` of the block that owns each."""
+    """Join the Gaussians of all blocks; also return the number ``[n]`` of the block that owns each Gaussian."""
     return Gaussians.concat(parts), np.repeat(np.arange(len(parts)), [len(gaussians) for gaussians in parts])
 
 
@@ -162,9 +163,10 @@ def adopt_records(outcomes: Iterable[tuple[T, Record]]) -> Iterator[tuple[T, dic
 
 
 def list_calls(starts: Sequence[BlockStart], *values: Any) -> Iterator[tuple[Any, ...]]:
-    """Yield the arguments of a call for each block: its start, the ``values``, and its number.
+    """Yield the arguments of a call for each block: the block's start, the ``values``, and the block's number.
 
-    The caller sends the arguments of one block before it asks for the next. Then the memory of the first is released.
+    The caller sends the arguments of one block before it asks for the next, so that the memory of the sent arguments is
+    released.
     """
     for number, start in enumerate(starts):
         yield start, *values, number
@@ -221,7 +223,8 @@ def finish_joined(
 def prune_joined(joined: Gaussians, cameras: Cameras, options: CompactOptions, limit: int | None) -> Gaussians:
     """Drop the Gaussians that no camera sees.
 
-    If the options fill the budget of ``limit`` Gaussians, as many of them are kept as the budget allows.
+    If the options fill the budget of ``limit`` Gaussians, as many of the dropped Gaussians are kept as the budget
+    allows.
     """
     seen, unseen = split_unseen(joined, cameras)
     max_unseen = len(unseen) if limit is None else max(0, limit - len(seen))
@@ -245,15 +248,15 @@ def with_choices(options: CompactOptions, choices: SceneChoices) -> CompactOptio
 def block_options(
     options: CompactOptions, scene: Scene, block: Block, factor: float, limit: int | None
 ) -> CompactOptions:
-    """Return the options of a block: those of the scene, but with its part of the Gaussians and of the fit's steps.
+    """Return the options of a block: those of the scene, but with the block's part of Gaussians and fit steps.
 
-    The part is that of the block's views. Its number of Gaussians is also multiplied by ``factor``. Cameras and
-    exposures stay fixed. ``limit`` is the number of Gaussians of all blocks together; None: ``superpixels`` and K
-    decide.
+    The part is the block's share of the views. The block's number of Gaussians is also multiplied by ``factor``.
+    Cameras and exposures stay fixed. ``limit`` is the number of Gaussians of all blocks together; None: ``superpixels``
+    and K decide.
     """
     settings: dict[str, Any] = {**ONE_PIECE, "budget": None}
     settings["fit_steps"] = max(1, round(options.fit.steps * len(block.views) / len(scene)))
-    # with few steps, the share of steps that draw a quarter of the pixels would be another one than in the whole scene
+    # with few steps, the share of steps that draw a quarter of the pixels would differ from that in the whole scene
     if replace(options.fit, fit_steps=settings["fit_steps"]).half_res_part != options.fit.half_res_part:
         settings["half_res_share"] = options.fit.half_res_part
     superpixels = options.segment.superpixels

@@ -50,8 +50,8 @@ def rescore(candidate: Candidate, gaussians: Gaussians, prepared: Prepared, plan
 def _measure_candidate(gaussians: Gaussians, moved: Prepared, plan: Plan) -> tuple[float | None, float | None]:
     """Return ``psnr`` and ``deciding_psnr`` of a candidate with these Gaussians of the world.
 
-    They are measured against photos, or against renders of the input if these stand for photos. Both are None without
-    either. ``moved`` is the scene with the cameras of the fit.
+    Both PSNR are measured against photos, or against renders of the input if the renders stand for photos. Both PSNR
+    are None without photos and renders. ``moved`` is the scene with the cameras of the fit.
     """
     if moved.reference.name == RENDERS:
         fidelity = _measure_fidelity(moved.frame.enter(round_for_output(gaussians, plan)), moved, plan)
@@ -80,7 +80,8 @@ def _measure_fidelity(gaussians: Gaussians, prepared: Prepared, plan: Plan) -> f
 def with_moved_views(prepared: Prepared, cameras: Cameras) -> Prepared:
     """Return a prepared scene whose views have the canonical ``cameras`` of a fit.
 
-    The views of the input, which are in the world, move along. If the fit moved no camera, theirs stay the same object.
+    The views of the input, which are in the world, move along. If the fit moved no camera, the input's cameras stay the
+    same object.
     """
     prepared = prepared.with_cameras(cameras)
     input_cameras = prepared.final_cameras()

@@ -51,7 +51,7 @@ from gsmerge.types import Gaussians, Scene, StrPath
 from gsmerge.values.arguments import check_arguments
 
 # If a result is clearly worse than its input, the scene is compacted again with these changes of the options, one after
-# another, until a result is not. A note has the words
+# another, until a result is not clearly worse. A note has the words
 SIMPLER: Sequence[tuple[str, Callable[[CompactOptions], CompactOptions]]] = (
     ("with the scene's own colours in place of the photos", lambda o: o.with_settings({"look": "scene"})),
     ("without a fit", lambda o: o.with_settings({"fit": "none"})),
@@ -70,7 +70,7 @@ def compact(
         scene: What :func:`gsmerge.read_scene` returns, or a path that it can read. A scene of tensors gives a result of
             tensors.
         options: Settings of all stages; None: the defaults.
-        progress: Called with (stage, done, stages); long stages also call it with ("fit: ...", step, steps).
+        progress: Called with (stage, done, stages); long stages also call ``progress`` with ("fit: ...", step, steps).
         **settings: Single settings by name that override ``options``: ``compact(scene, k=2, superpixels="1%")``.
 
     Raises:
@@ -114,8 +114,8 @@ def compact_scene(scene: Scene, options: CompactOptions) -> CompactResult:
 def _compact_simpler(scene: Scene, options: CompactOptions, result: CompactResult) -> CompactResult:
     """Compact a scene again with the changes of ``SIMPLER``, until a result is not clearly worse than its input.
 
-    ``result`` is the first result, which is clearly worse. A note says what was changed. Raises TargetError if all
-    results are clearly worse.
+    ``result`` is the first result, which is clearly worse than the input. A note says what was changed. Raises
+    TargetError if all results are clearly worse than the input.
     """
     cause = result.report.worse
     for words, change in SIMPLER:
@@ -134,7 +134,7 @@ def _compact_simpler(scene: Scene, options: CompactOptions, result: CompactResul
 
 
 def _compact_once(scene: Scene, options: CompactOptions) -> CompactResult:
-    """Compact a scene: in blocks if its views are cut into several, otherwise in one piece."""
+    """Compact a scene: in blocks if the views are cut into several blocks, otherwise in one piece."""
     size, budget = measure_size(scene), options.budget
     if budget.number is not None and budget.number > size.num_gaussians:
         note(f"budget {budget.budget}: the input has only {size.num_gaussians:,} Gaussians, so the result has no more")
@@ -153,8 +153,8 @@ def _compact_once(scene: Scene, options: CompactOptions) -> CompactResult:
 def compact_in_one_piece(prepared: Prepared, method: Method, options: CompactOptions) -> CompactResult:
     """Compact a prepared scene with a method, in one piece.
 
-    A search finds the number of Gaussians, unless the options state it, and builds the result. Then its coarser levels
-    are built, a trial measures what new views gain, and the input is scored for the report.
+    A search finds the number of Gaussians, unless the options state it, and builds the result. After the result its
+    coarser levels are built, a trial measures what new views gain, and the input is scored for the report.
     """
     plan = add_target(make_plan(prepared, options), prepared)  # from here on, the plan replaces the options
     costs = measure_costs(prepared, plan)
@@ -174,7 +174,7 @@ def compact_in_one_piece(prepared: Prepared, method: Method, options: CompactOpt
 
 
 def run_search(search: CountSearch, build: Build, prepared: Prepared) -> Candidate:
-    """Run a search for the number of Gaussians; return its best candidate, built from all views and cleaned up."""
+    """Run a search for the number of Gaussians; return the best candidate, built from all views and cleaned up."""
     plan = search.plan
     if search.left_out is not None:  # its candidates lack views, so the best count is built again
         search.run(partial(build_left_out, build, search.left_out, search.left_out.plan(plan)))
@@ -189,7 +189,7 @@ def run_search(search: CountSearch, build: Build, prepared: Prepared) -> Candida
 def find_count(scene: Scene, options: CompactOptions) -> int:
     """Return the number of Gaussians that a run gives a scene without cameras, if a PSNR decides it.
 
-    It is found by the same search as in a run, for an estimate.
+    Estimates find the number by the same search as runs.
     """
     with use_threads(options.threads), record_part(silent=True):
         method = choose_method(options, scene)
@@ -225,8 +225,8 @@ def clean_best(candidate: Candidate, prepared: Prepared, plan: Plan) -> Candidat
 def build_cleaned(build: Build, prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
     """Build Gaussians and clean them up, so that ``count`` remain if the scene has that many.
 
-    A few more than ``count`` are built. If too few remain after clean-up, they are built once more, with as large a
-    surplus as clean-up dropped. If too many remain, the faintest are dropped.
+    A few more than ``count`` are built. If too few Gaussians remain after clean-up, all are built once more, with as
+    large a surplus as clean-up dropped. If too many Gaussians remain, the faintest are dropped.
     """
     if not plan.clean.asked:
         return build(prepared, plan, count)
@@ -258,7 +258,8 @@ def _clean_fitted(fitted: Fitted, prepared: Prepared, plan: Plan) -> tuple[Gauss
     """Clean up fitted Gaussians; return the remaining Gaussians, and the number of dropped Gaussians by reason."""
     from gsmerge.stages.clean import clean
 
-    # Cameras that were placed for scores are too few to show all of the scene. Without cameras, `clean` places its own
+    # Cameras that were placed for scores are too few to show all of the scene. Without cameras, `clean` places cameras
+    # of its own
     cameras = None if prepared.reference.placed else fitted.cameras[sorted({*prepared.repeated})]
     rows, dropped = clean(fitted.gaussians, plan.clean, cameras, prepared.scene.images, prepared.frame.leave)
     return fitted.gaussians[rows], dropped
@@ -269,8 +270,8 @@ def _record_dropped(dropped: dict[str, int], remaining: int, count: int | None, 
     from gsmerge.stages.clean import describe_counts
 
     record_choices(clean=dropped)
-    # The input was cropped before the run. Here only Gaussians are cropped that the fit moved across the border, and
-    # usually there are none
+    # The input was cropped before the run. The crop below only removes Gaussians that the fit moved across the border,
+    # usually none
     shown = {name: number for name, number in dropped.items() if number or name != "cropped"}
     if shown:
         note(f"left out by clean-up: {describe_counts(shown, placed=prepared.reference.placed)}")

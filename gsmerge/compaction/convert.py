@@ -1,4 +1,4 @@
-"""Convert files of Gaussians from format to format without a fit; they may be joined, cleaned and moved."""
+"""Convert files of Gaussians from format to format without a fit; the Gaussians may be joined, cleaned and moved."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
 
 
 def _join_comments(infos: Sequence[FileInfo], format_: Format, *, moves: bool) -> tuple[list[str], list[str]]:
-    """Return the header comments that all files have, and notes about the others, which the output lacks.
+    """Return the header comments that all files have, and notes about the other comments, which the output lacks.
 
     If the scene moves, comments about its frame are no longer true, and are left out.
     """
@@ -149,7 +149,7 @@ def conversion_line(document: dict[str, Any]) -> str:
 
 
 def _unseen_notes(options: ConvertOptions, unseen: int, count: int, cameras: StrPath | None) -> list[str]:
-    """Return a note about ``--drop unseen`` if no cameras are known, or if they see less than half of the Gaussians."""
+    """Return a note about ``--drop unseen`` if no cameras are known, or if ``unseen`` are most of ``count``."""
     if cameras is None:
         likely = None if options.cameras == NONE else find_scene_files(options.inputs[0]).cameras
         remedy = "" if options.cameras == NONE else f"; name them with --cameras {likely or 'FILE'}"
@@ -169,7 +169,7 @@ def join_gaussians(parts: Sequence[Gaussians]) -> Gaussians:
 def _find_cameras(options: ConvertOptions) -> tuple[CameraFile | None, list[str]]:
     """Return the cameras that the options name, or else those of the first input if it is a result, and notes.
 
-    If the latter cannot be read, a note says so, and None is returned.
+    If the cameras of the first input cannot be read, a note says so, and None is returned in place of cameras.
     """
     named, first_input = options.cameras, options.inputs[0]
     path = result_cameras(first_input) if named is None else named_path(named)

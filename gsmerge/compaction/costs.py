@@ -70,8 +70,8 @@ class RunCosts:
     def all_parts(self, limits: CountLimits, count: int) -> list[RunPart]:
         """Return the parts that a run for about ``count`` Gaussians is expected to have, in their order.
 
-        First come the fits of a curve, if there is one. Then come the build of the result, or those of all candidates
-        of a search. The parts of :meth:`end_parts` follow.
+        First come the fits of a curve, if there is one. After the curve comes the build of the result, or the builds of
+        all candidates of a search. The parts of :meth:`end_parts` follow.
         """
         choice = self.choice
         builds_of_search = USUAL_BUILDS_OF_RENDERS if choice.rendered else USUAL_BUILDS
@@ -82,7 +82,7 @@ class RunCosts:
         return [*parts, *self.end_parts(count, level_counts(count, self.settings["levels"], limits.min_count))]
 
     def build_part(self, count: float, steps: int | None = None) -> RunPart:
-        """Return the part that builds ``count`` Gaussians with a fit of ``steps``; None: as many steps as the run."""
+        """Return the part that builds ``count`` Gaussians with a fit of ``steps``; None: the run's steps."""
         settings, steps = self.settings, self.steps if steps is None else steps
         method = settings["method"]
         work = COST_PAIRS if self.merges_pairs else COST_BUILD
@@ -96,7 +96,8 @@ class RunCosts:
     def end_parts(self, count: float, coarser: Sequence[float]) -> list[RunPart]:
         """Return the parts that follow after the result is built: coarser levels, a trial, and scores of the input.
 
-        ``count`` is the number of Gaussians of the result, ``coarser`` those of the levels. The trial has two rounds.
+        ``count`` is the number of Gaussians of the result, and ``coarser`` has the numbers of the coarser levels. The
+        trial has two rounds.
         """
         build = self.build_part(count)
         trial = [RunPart(TRIAL_SHARE * build.stages, TRIAL_SHARE * build.fits, 2)] * self.has_trial
@@ -112,7 +113,7 @@ class RunCosts:
 def mean_inside(scene: Scene) -> float:
     """Return the share of a scene's Gaussians that lies in a view, as the mean of all views; 1 without views.
 
-    It is measured on a sample.
+    The share is measured on a sample of the Gaussians.
     """
     return float(np.mean(shares_inside(scene, INSIDE_GAUSSIANS) or [1.0]))
 

@@ -1,7 +1,7 @@
 """Find results that are clearly worse than their input, in pictures that no fit has seen.
 
 The input differs from the photos by its error. A result that differs from the input by more than twice this error has
-itself a larger error than the input, by the triangle inequality. So bad results are found whatever their cause is.
+itself a larger error than the input, by the triangle inequality. This test finds bad results whatever their cause is.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ MOST_PHOTOS, MOST_BETWEEN = 2, 3  # most photos that are compared, and most came
 def is_clearly_worse(input_psnr: float | None, result_psnr: float | None) -> bool:
     """Return whether a result has more than twice the error of its input and looks wrong, by their PSNR (dB).
 
-    False if one of them could not be measured.
+    False if one of the two PSNR could not be measured.
     """
     # NaN is not less than any number
     return input_psnr is not None and result_psnr is not None and result_psnr < min(input_psnr - TWICE_DB, WRONG_DB)
@@ -42,7 +42,7 @@ def is_clearly_worse(input_psnr: float | None, result_psnr: float | None) -> boo
 
 @stage("input")
 def describe_clear_loss(gaussians: Gaussians, prepared: Prepared) -> str | None:
-    """Say that a result is clearly worse than its input in pictures between the views; None if it is not.
+    """Say that a result is clearly worse than its input in pictures between the views; None if the result is not.
 
     ``gaussians`` are the canonical Gaussians of the result. The scene has photos.
     """

@@ -38,9 +38,9 @@ def measure_bytes(gaussians: Gaussians, file: Format, cameras: Cameras, names: S
 def meet_bytes(candidate: Candidate, build_again: BuildCandidate, prepared: Prepared, plan: Plan) -> Candidate:
     """Make the file of a candidate nearly as large as a budget in bytes allows.
 
-    The candidate is rebuilt with other counts until its file is about that large. Then the faintest Gaussians are
-    dropped until the file fits. The candidate is returned unchanged without a budget in bytes, or if the format has a
-    fixed number of bytes for each Gaussian.
+    The candidate is rebuilt with other counts until its file is about as large as allowed. Of the last build, the
+    faintest Gaussians are dropped until the file fits. The candidate is returned unchanged without a budget in bytes,
+    or if the format has a fixed number of bytes for each Gaussian.
     """
     if plan.size is None or not plan.size.packed:
         return candidate
@@ -54,7 +54,7 @@ def meet_bytes(candidate: Candidate, build_again: BuildCandidate, prepared: Prep
         num_bytes = measure_bytes(last.gaussians, file, last.cameras, names)
         expected_count = int(BUILD_SURPLUS * count * (max_bytes - base_bytes) / max(num_bytes - base_bytes, 1))
         next_count = min(expected_count, plan.limits.most)
-        # Gaussians that no view sees were dropped from the requested number. Others do not take their place
+        # Gaussians that no view sees were dropped from the requested number, and no other Gaussians take their place
         requested_count = max(count, last.count or 0)
         requested_bytes = base_bytes + (num_bytes - base_bytes) * requested_count / max(count, 1)
         near_share = 0.97  # share of the allowed bytes that is near enough
@@ -71,7 +71,7 @@ def meet_bytes(candidate: Candidate, build_again: BuildCandidate, prepared: Prep
 def measure_least_bytes(
     gaussians: Gaussians, max_bytes: int, file: Format, cameras: Cameras, names: Sequence[str] = ()
 ) -> int:
-    """Return the bytes of a file with one Gaussian; UsageError if these are more than ``max_bytes``."""
+    """Return the bytes of a file with one Gaussian; UsageError if this file has more than ``max_bytes``."""
     base_bytes = measure_bytes(gaussians[:1], file, cameras, names)
     if base_bytes > max_bytes:
         problem = f"expected at least {human_bytes(base_bytes)} for a {file.ending} with one Gaussian"

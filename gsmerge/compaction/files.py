@@ -116,7 +116,7 @@ def read_input(
     """
     stats = read_stats(files)
     loaded = load_files(files, opacity=opacity, hints=hints)
-    # The scene already has the photos that were inside the camera file, so this copy is freed
+    # The scene already has the photos that were inside the camera file, so the copy in ``loaded`` is freed
     cameras = None if loaded.cameras is None else replace(loaded.cameras, images=())
     sha256 = file_sha256(*files.all_plys) if hashed else None
     if changed := list_changed(stats):
@@ -128,8 +128,8 @@ def read_input(
 def _compact_notes(loaded: Loaded) -> list[str]:
     """Return notes on columns that the result will lack, and on a scene that is a result already.
 
-    A file of gsmerge is recognised by its header or, in formats without one, by the cameras beside it. It is a result
-    if its header says so, or if it has at most one Gaussian for every two pixels of its views.
+    A file of gsmerge is recognised by its header or, in formats without one, by the cameras beside it. A file of
+    gsmerge is a result if its header says so, or if it has at most one Gaussian for every two pixels of its views.
     """
     scene, comments, notes = loaded.scene, loaded.info.comments, list[str]()
     unused = " ".join(note for note in loaded.info.adapted if note.startswith(UNUSED))  # columns that a note names

@@ -52,7 +52,7 @@ class LeftOut:
         return max(1, round(count * views / (views + len(self.photos))))
 
     def plan(self, plan: Plan, **settings: Any) -> Plan:
-        """Plan a run on the other views with the settings of ``plan``, some of which ``settings`` replace.
+        """Plan a run on the views that remain with the settings of ``plan``, some of which ``settings`` replace.
 
         Settings that depend on the whole scene, such as a crop, are replaced by those of ``TRIAL``.
         """
@@ -97,7 +97,7 @@ def choose_left_out(views: Sequence[int]) -> tuple[list[int], list[int]]:
 
 
 def can_leave_out(prepared: Prepared) -> bool:
-    """Return whether some views can be left out: enough views have photos, and they have Gaussians of their own."""
+    """Return whether some views can be left out: enough views have photos, and views have Gaussians of their own."""
     reference = prepared.reference
     has_photos = reference.name == PHOTOS and len(reference.score_views) >= LEAST_VIEWS
     return has_photos and prepared.scene.has_own_pixels

@@ -30,9 +30,9 @@ class Method:
 
     Args:
         name: The name on the command line.
-        run: A function of a prepared scene, a plan and a number of Gaussians. It returns at most so many canonical
-            Gaussians, unless the method keeps those of the input. Its parts are blocks of
-            :func:`gsmerge.runtime.record.stage`, which measures their time.
+        run: A function of a prepared scene, a plan and a number of Gaussians. The function returns at most this number
+            of canonical Gaussians, unless the method keeps the Gaussians of the input. The function's parts are blocks
+            of :func:`gsmerge.runtime.record.stage`, which measures their time.
         needs_photos: The scene must have photos.
         uses: Flat names of the settings that it uses, in addition to those that all methods use.
         check: Raises a UsageError if a program that the method runs is missing.
@@ -65,7 +65,7 @@ OWN_METHOD = _OwnMethod(OURS, lambda *arguments: build(*arguments).gaussians)
 
 
 def find_method(options: CompactOptions) -> Method:
-    """Load the method that the options name; UsageError if a program that it runs is missing."""
+    """Load the method that the options name; UsageError if a program that the method runs is missing."""
     if options.method == OURS:
         return OWN_METHOD
     method: Method = load_plugin(METHODS, options.method)
@@ -74,9 +74,9 @@ def find_method(options: CompactOptions) -> Method:
 
 
 def is_without_views(scene: Scene, options: CompactOptions) -> bool:
-    """Return whether a run works without views: the scene has none, and no option asks for a stage that needs them.
+    """Return whether a run works without views: the scene has none, and no option asks for a stage that needs views.
 
-    Gaussians are then merged with their neighbours, by positions and colours alone.
+    Without views, Gaussians are merged with their neighbours, by positions and colours alone.
     """
     return len(scene) == 0 and not options.replaces_stages
 
@@ -84,7 +84,7 @@ def is_without_views(scene: Scene, options: CompactOptions) -> bool:
 def choose_method(options: CompactOptions, scene: Scene) -> Method:
     """Choose the method for a scene; a note lists the changed settings that the method ignores.
 
-    Raises UsageError if the scene lacks what the method needs, or if a program that it runs is missing.
+    Raises UsageError if the scene lacks what the method needs, or if a program that the method runs is missing.
     """
     if is_without_views(scene, options):
         kinds = (PrepareOptions, SegmentOptions, MatchOptions, DecodeOptions)  # settings that act on views

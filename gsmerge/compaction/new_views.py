@@ -1,8 +1,8 @@
 """Estimate how much new views gain, by a trial on small photos that a short fit has not seen.
 
-Scores on photos that a fit has seen only say how well it remembers them. So the trial leaves out some views with their
-Gaussians, and compacts the other views at a small size. The photos that were left out then score the Gaussians of the
-other views before and after compaction, over the pixels that the other views see.
+Scores on photos that a fit has seen only say how well the fit remembers these photos. The trial therefore leaves out
+some views with their Gaussians, and compacts the other views at a small size. The photos that were left out then score
+the Gaussians of the other views before and after compaction, over the pixels that the other views see.
 """
 
 from __future__ import annotations
@@ -27,20 +27,22 @@ from gsmerge.settings.stages import SHARE
 from gsmerge.types import Cameras, PicturedScene, Pixels
 
 TRIAL_PIXELS = 120  # the longer side of the small pictures has at least this many pixels
-# Most steps of the fit. With fewer than 150 steps, fits of few views have other settings
+# Most steps of the fit. With fewer than 150 steps, fits of few views have other settings than longer fits
 # (gsmerge.fit.schedule.MANY_STEPS), and predict less
 TRIAL_STEPS = 200
-# Most views of a round: those nearest to the left-out ones. Farther views show little of what these show. With more
-# views, TRIAL_STEPS would also draw each view too seldom to tell how a run with more steps ends
+# Most views of a round: those nearest to the left-out views. Farther views show little of what the left-out views show.
+# With more than TRIAL_VIEWS views, TRIAL_STEPS would also draw each view too seldom to tell how a run with more steps
+# ends
 TRIAL_VIEWS = 64
 # Small pictures have more detail in each pixel, so they lose more with few Gaussians. The trial therefore has more
-# Gaussians per pixel than the result. If the result has x times the usual share, the trial has x to the power of
-# SHARE_POWER times this share. On five captures at 1 % this lowers the error of the estimated gain from 2.3 to 1.0 dB
+# Gaussians per pixel than the result. If the result has x times the usual number of Gaussians per pixel, the trial has
+# x to the power of SHARE_POWER times the usual number. On five captures at 1 % the larger number lowers the error of
+# the estimated gain from 2.3 to 1.0 dB
 USUAL_DENSITY, SHARE_POWER = parse_share(SHARE), 0.3
-# The expected gain of new views is a weighted mean of two gains: that of the result's own photos, as far as depth is
-# confirmed, with the weight OWN_WEIGHT, and that of left-out photos in the trial. The true gain lies between the two,
-# or at most SPREAD dB outside, for 80 % of the results or more, on ten captures and on five others
-# (docs/internals/notebook.md). Nothing is known about results with more than MOST_SHARE Gaussians for each pixel
+# The expected gain of new views is a weighted mean of two gains: the gain of the result's own photos, as far as depth
+# is confirmed, with the weight OWN_WEIGHT, and the gain of left-out photos in the trial. The true gain lies between
+# these two gains, or at most SPREAD dB outside of them, for 80 % of the results or more, on ten captures and on five
+# others (docs/internals/notebook.md). Nothing is known about results with more than MOST_SHARE Gaussians for each pixel
 OWN_WEIGHT, SPREAD, MOST_SHARE = 0.2, 1.25, 0.1
 
 
@@ -74,8 +76,8 @@ class Trial:
 
         ``own_before`` and ``own_after`` are the PSNR (dB) of the result's own photos, rendered from the input and from
         the result. ``confirmed`` is the share of the pixels whose depth other views confirm. New views gain at most
-        this share of what own photos gain. The input is assumed to show new views worse than its own views, by the same
-        difference as in the trial.
+        this share of what own photos gain. The input is assumed to show new views worse than its own views, by as much
+        as in the trial.
         """
         most_gain = confirmed * max(0.0, own_after - own_before)
         least_gain = min(self.after - self.before, most_gain)
@@ -95,8 +97,8 @@ def try_new_views(prepared: Prepared, plan: Plan, build: Build, count: int) -> T
     """Run the trial for a result of ``count`` Gaussians, in two rounds, and return what it measured.
 
     None if the plan wants no trial, with too few photos, or with too many Gaussians. None also if views have no
-    Gaussians of their own, because the content of the left-out photos would remain in the Gaussians. The error of the
-    estimate would then be 2 dB instead of 1.2, and the trial would take a quarter of a run's time.
+    Gaussians of their own, because the content of the left-out photos would remain in the Gaussians. A trial with this
+    content has an error of 2 dB instead of 1.2 dB, and takes a quarter of a run's time.
     """
     if not plan.new_views or not can_try(prepared, count):
         return None
@@ -118,9 +120,9 @@ def try_new_views(prepared: Prepared, plan: Plan, build: Build, count: int) -> T
 def _score_round(prepared: Prepared, views: Sequence[int], plan: Plan, build: Build, share: float) -> np.ndarray | None:
     """Leave out ``views``, compact other views near them at a small size, and score the result on the left-out photos.
 
-    ``share`` is the number of Gaussians per pixel. Returns an array ``[4,v]``. Its rows are the share of each photo
-    that the other views see, and the PSNR (dB) of renders from all Gaussians, from those of the other views, and from
-    the result. None if no other view sees what the photos show.
+    ``share`` is the number of Gaussians per pixel. Returns an array ``[4,v]``, whose rows are the share of each photo
+    that the other views see, and the PSNR (dB) of renders from all Gaussians, from the Gaussians of the other views,
+    and from the result. None if no other view sees what the photos show.
     """
     used_views = views_around(prepared.scene.cameras, views, TRIAL_VIEWS)
     scene = prepared.scene if len(used_views) == len(prepared.scene) else subset(prepared.scene, used_views)
@@ -130,7 +132,7 @@ def _score_round(prepared: Prepared, views: Sequence[int], plan: Plan, build: Bu
         return None
     superpixels = max(1, round(share * small.pixels_per_view))
     trial_plan = left_out.plan(plan, superpixels=superpixels, k=1, fit_steps=min(TRIAL_STEPS, plan.fit.steps))
-    # The fit draws no views from outside, and nothing is pruned. Both hardly change the score
+    # The fit draws no views from outside, and nothing is pruned. Views from outside and pruning hardly change the score
     # (docs/internals/notebook.md)
     fit = replace(trial_plan.fit, tuning=replace(trial_plan.fit.tuning, outside_from=1.0))
     compacted = build(left_out.rest, replace(trial_plan, fit=fit, is_trial=True), None).gaussians

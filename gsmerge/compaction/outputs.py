@@ -20,8 +20,8 @@ from gsmerge.settings.files import FileOptions
 from gsmerge.settings.placement import AXES
 from gsmerge.types import Cameras
 
-# Two cameras are the same if their viewmats and Ks differ by rounding alone. For viewmats this is a share of the
-# largest translation. Ks may differ by this share, or by a hundred times this number in pixels
+# Two cameras are the same if their viewmats and Ks differ by rounding alone. Viewmats may differ by this share of the
+# largest translation. Ks may differ by this share of their value, or by a hundred times this number in pixels
 CAMERA_TOLERANCE = 1e-5
 
 
@@ -36,7 +36,7 @@ class Outputs:
 
     @property
     def format(self) -> Format:
-        """The format of the result; UsageError if its name has no ending that can be written."""
+        """The format of the result; UsageError if the name has no ending that can be written."""
         return output_format(self.result)
 
     @property
@@ -74,9 +74,10 @@ def write_outputs(outputs: Outputs, contents: Contents) -> int:
 def add_outputs(add: AddOutput, outputs: Outputs, temporary: Path, contents: Contents) -> dict[Path, list[Path]]:
     """Write the files of an output in a block of :func:`atomic_outputs`; return the temporary files of each level.
 
-    ``add`` is what the block yields, and ``temporary`` what it has returned for the result. Viewers of some formats
-    start at the first camera in the file, or in a file of settings beside it. If the scene has no camera, one is placed
-    for them. A file of settings that exists already stays unchanged, unless gsmerge wrote it and may overwrite files.
+    ``add`` is what the block yields, and ``temporary`` is what ``add`` has returned for the result. Viewers of some
+    formats start at the first camera in the file, or in a file of settings beside it. If the scene has no camera, one
+    is placed for these viewers. A file of settings that exists already stays unchanged, unless gsmerge wrote it and may
+    overwrite files.
     """
     format_, gaussians, has_views = outputs.format, contents.levels[0], len(contents.cameras) > 0
     contents = replace(contents, options=outputs.options)
@@ -111,8 +112,8 @@ def frame_notes(outputs: Outputs, cameras: Cameras) -> list[str]:
 def _add_cameras(add: AddOutput, path: Path, contents: Contents, *, overwrite: bool) -> None:
     """Write the file of cameras for viewers in a block of :func:`atomic_outputs`.
 
-    Results in several formats share this file. If it has these cameras already, to within rounding, it stays unchanged.
-    Raises UsageError if it has other cameras.
+    Results in several formats share one file of cameras. An existing file with the same cameras, to within rounding,
+    stays unchanged. Raises UsageError if the file has other cameras.
     """
     cameras, names = contents.cameras, contents.names
     if overwrite or not path.exists():
@@ -124,7 +125,7 @@ def _add_cameras(add: AddOutput, path: Path, contents: Contents, *, overwrite: b
 def refuse_to_replace_cameras(path: Path, cameras: Cameras, names: Sequence[str], *, moved: bool = False) -> None:
     """Raise UsageError if an existing file has other cameras than these, to within rounding.
 
-    ``moved``: the run may still move these cameras, so poses are not compared.
+    If ``moved``, poses are not compared, because the run may still move these cameras.
     """
     if not _has_cameras(path, cameras, names, moved=moved):
         remedy = "name another output, or pass --overwrite to replace it"

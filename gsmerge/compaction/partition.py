@@ -1,7 +1,7 @@
 """Cut a scene into blocks of views that see the same surfaces; each block also gets some views of its neighbours.
 
 Views are nodes of a graph. The weight of an edge says how much two views see of each other's surfaces. Blocks grow one
-after another. Each begins at the border of the views that are left, and each step adds the view that shares most
+after another. A block begins at the border of the views that are left, and each step adds the view that shares most
 surfaces with the block.
 """
 
@@ -106,7 +106,7 @@ def count_factors(blocks: Sequence[Block], covisibility: Covisibility) -> np.nda
     """Return for each block the factor on its number of Gaussians that makes all blocks equally dense.
 
     Some Gaussians on surfaces of a block belong to pixels of views outside it, so the block is built without them. The
-    Gaussians of its own views are then increased by this factor.
+    number of Gaussians from the block's own views is then multiplied by the factor.
     """
     views = range(len(covisibility.cameras))
     owners = owning_views(covisibility.samples, covisibility, views)
@@ -153,8 +153,8 @@ def partition_apart(weights: np.ndarray, count: int) -> list[Block]:
 def grow_blocks(weights: np.ndarray, count: int) -> np.ndarray:
     """Return the block of each view ``[v]``, 0 to ``count - 1``; blocks grow one after another.
 
-    A free view has no block yet. A block begins with the free view that has the weakest edges to other free views. It
-    grows by the free view that shares most with the block.
+    A free view has no block yet. A block begins with the free view that has the weakest edges to other free views. The
+    block grows by the free view that shares most with it.
     """
     num_views = len(weights)
     labels, is_free = np.full(num_views, -1), np.ones(num_views, bool)
@@ -177,8 +177,8 @@ def grow_blocks(weights: np.ndarray, count: int) -> np.ndarray:
 def owning_views(points: np.ndarray, covisibility: Covisibility, views: Sequence[int]) -> np.ndarray:
     """Return the owner ``[n]`` of each point ``[n,3]``: the nearest of the ``views`` that see the point.
 
-    If no view sees the point, the owner is the nearest view whose picture contains it. If no picture contains it, the
-    owner is the nearest view.
+    If no view sees the point, the owner is the nearest view whose picture contains it. If no picture contains the
+    point, the owner is the nearest of all views.
     """
     cameras, depths = covisibility.cameras[list(views)], covisibility.depths[list(views)]
     centres = camera_centres(cameras.viewmats.astype(np.float64))

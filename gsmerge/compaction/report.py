@@ -22,8 +22,8 @@ class Covered:
     """PSNR over the pixels of the input views that the input covers, if it does not cover all.
 
     Args:
-        share: Share of the scored pixels that the input covers. If a file has rows for some pixels only, it covers
-            these; otherwise it covers the pixels in which its opacity is at least a half.
+        share: Share of the scored pixels that the input covers. An input file with rows for some pixels only covers
+            these pixels; any other input covers the pixels in which its opacity is at least a half.
         before: Mean PSNR (dB) of the covered pixels, rendered from the input.
         after: Mean PSNR (dB) of the covered pixels, rendered from the result.
     """
@@ -38,7 +38,7 @@ def compared_psnr(
 ) -> tuple[float | None, float | None]:
     """Return the PSNR (dB) of input and result that are compared with each other.
 
-    They are those over the pixels that the input covers, if it does not cover all.
+    If the input does not cover all pixels, the PSNR is over the pixels that the input covers.
     """
     return (before, after) if covered is None else (covered.before, covered.after)
 
@@ -65,30 +65,31 @@ class CompactReport:
         num_output: Gaussians in the result.
         seconds: Wall time of each stage.
         psnr_before: Mean PSNR (dB) of the input views, rendered from the input; None if neither photos nor pixels are
-            known. It is measured on a tenth of the pixels of at most eight views, unless a quality was asked for, or
-            the result may be worse. The gain by such a sample is off by .3 dB (rms); :func:`gsmerge.evaluate` is exact.
+            known. The PSNR is measured on a tenth of the pixels of at most eight views, unless a quality was asked for,
+            or the result may be worse than the input. The gain on this sample is off by .3 dB (rms);
+            :func:`gsmerge.evaluate` is exact.
         new_views: Expected PSNR of new views, estimated on photos that a short fit left out; None with fewer than four
             photos, in drafts, and in blocks.
         psnr_after: Like ``psnr_before``, but rendered from the result. If the format of the output rounds positions
             visibly, the rounded Gaussians are rendered.
-        choices: Decisions of the stages (count, curve, search, merge, scores, clusters, fit). ``pruned`` is the number
-            of Gaussians that the result has less than allowed, because no view shows more. Without photos and pixels,
-            ``fidelity`` has the ``psnr`` (dB) against renders of the input, and the number of ``views`` of these
-            renders. ``held_out`` is true if the views were placed because the scene has no cameras.
+        choices: Decisions of the stages (count, curve, search, merge, scores, clusters, fit). ``pruned`` says by how
+            many Gaussians the result is smaller than allowed, because no view shows more Gaussians. Without photos and
+            pixels, ``fidelity`` has the ``psnr`` (dB) against renders of the input, and the number of ``views`` of
+            these renders. ``held_out`` is true if the views were placed because the scene has no cameras.
         notes: Warnings about the input and notes about what was adapted to it, one sentence each.
         options: All settings by flat name.
         peak_memory_bytes: Largest resident memory of the process so far.
-        unmet: Why a target that was asked for is not met, and how near the result came; None if it is met.
-        worse: A warning that the result is worse than the input, which is also among the notes; None if it is not, or
-            if that cannot be measured. The result is worse if it shows the scene's own photos more than .5 dB worse
-            than the input, or if ``is_far`` is true. If ``fidelity`` is measured, it is worse below 30 dB.
-            docs/reference/report.md lists all cases.
+        unmet: Why a target that was asked for is not met, and how near the result came; None if the target is met.
+        worse: A warning that the result is worse than the input, which is also among the notes; None if the result is
+            not worse, or if this cannot be measured. The result is worse if it shows the scene's own photos more than
+            .5 dB worse than the input, or if ``is_far`` is true. If ``fidelity`` is measured, the result is worse if
+            its ``psnr`` is below 30 dB. docs/reference/report.md lists all cases.
         psnr_reference: What the PSNR of the input views is measured against: "photos" or "the model's own pixels"; None
-            if it is not measured.
-        covered: PSNR over the pixels that the input covers; None if it covers at least 98 % of them.
-        is_far: The result is clearly worse than the input. Its pictures differ from the photos more than twice as much
-            as those of the input. Or, between the views, they differ from those of the input more than twice as much as
-            these differ from the photos.
+            if the PSNR is not measured.
+        covered: PSNR over the pixels that the input covers; None if the input covers at least 98 % of all pixels.
+        is_far: The result is clearly worse than the input. Either the result's pictures differ from the photos more
+            than twice as much as the input's pictures. Or, between the views, the result's pictures differ from the
+            input's pictures more than twice as much as the input's pictures differ from the photos.
         photo_files: PSNR on the photos as they are in their files; None if the run changed no photo.
         protected: PSNR over the pixels that ``protect`` marks, and their share of all pixels; None without such pixels.
 
@@ -168,9 +169,9 @@ def report_document(
         cameras_path: The file of cameras for viewers, if any.
 
     Returns:
-        The keys of the document, which docs/reference/report.md describes. They are those of :class:`CompactReport`,
-        partly under other names, and facts about the files. ``worse`` is the warning of the result or, if it has none,
-        of a level. Within a ``schema_version`` keys are only added.
+        The keys of the document, which docs/reference/report.md describes. The keys are those of
+        :class:`CompactReport`, partly under other names, and facts about the files. ``worse`` is the warning of the
+        result or, if it has none, of a level. Within a ``schema_version`` keys are only added.
     """
     numbers, at = asdict(report), written_at or {}
     return {
@@ -308,7 +309,7 @@ def curve_lines(document: Mapping[str, Any]) -> list[str]:
 def _scores_on_files(document: Mapping[str, Any]) -> Mapping[str, float] | None:
     """Return the PSNR on the photos as they are in their files, before and after.
 
-    None if that would print the same numbers as the PSNR on the photos that the run changed.
+    None if these numbers are printed the same as the PSNR on the photos that the run changed.
     """
     on_files, own = document.get("psnr_photo_files"), document["psnr_input_views"]
     if on_files is None or own["after"] is None or any(f"{on_files[name]:.2f}" != f"{own[name]:.2f}" for name in own):

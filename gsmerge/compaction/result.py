@@ -43,8 +43,8 @@ class CompactResult:
     Args:
         gaussians: The Gaussians.
         report: The report of the run.
-        cameras: The given views in the same frame. Wrong poses have been corrected, see ``poses`` of
-            :class:`gsmerge.settings.stages.PrepareOptions`.
+        cameras: The cameras of the input's views, in the frame of the Gaussians. Wrong poses have been corrected, see
+            ``poses`` of :class:`gsmerge.settings.stages.PrepareOptions`.
         coarser: Coarser levels of detail; each has a quarter of the Gaussians of the level before.
         names: Names of the views.
         scene: The path of the scene that was given, or a weak reference to it, which does not keep it in memory.
@@ -99,8 +99,8 @@ class CompactResult:
     def show(self, scene: Scene | StrPath | None = None) -> Page:
         """Show the scene and the result as :func:`gsmerge.view` does, in a notebook at the end of a cell.
 
-        ``scene``: the input. It only has to be given if it is no longer in memory; without an input the result is shown
-        alone.
+        ``scene``: the input, which only has to be given if it is no longer in memory; without an input the result is
+        shown alone.
         """
         from gsmerge.pages.view import view
 
@@ -115,7 +115,7 @@ class CompactResult:
         return f"CompactResult({self.gaussians!r}, {self.cameras!r}{levels})"
 
     def to_single(self) -> CompactResult:
-        """Return the same result with float32 means; its Gaussians have to be NumPy arrays, not tensors."""
+        """Return the same result with float32 means; the Gaussians have to be NumPy arrays, not tensors."""
         coarser = tuple(level.to_single() for level in self.coarser)
         return replace(self, gaussians=replace(self.gaussians, means=to_float32(self.gaussians.means)), coarser=coarser)
 

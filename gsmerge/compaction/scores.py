@@ -18,8 +18,9 @@ from gsmerge.runtime.record import stage
 from gsmerge.stages.prune import ROUNDING
 from gsmerge.types import Gaussians, Scene
 
-# A sample has one of INPUT_EVERY tiles of the scored photos for the input. For a result it has one of RESULT_EVERY,
-# because its far fewer Gaussians are drawn faster. On fifteen captures the gain by such samples is off by .27 dB (rms)
+# The input is scored on one of INPUT_EVERY tiles of the photos. A result is scored on one of RESULT_EVERY tiles,
+# because the far fewer Gaussians of a result are drawn faster. On fifteen captures the gain on such tiles differs by
+# .27 dB (rms) from the gain on whole photos
 INPUT_EVERY, RESULT_EVERY = 10, 2
 
 
@@ -44,7 +45,7 @@ def may_leave_gaps(prepared: Prepared, plan: Plan) -> bool:
 
 
 def round_for_output(gaussians: Gaussians, plan: Plan) -> Gaussians:
-    """Round the values of Gaussians as the output file does; return them unchanged if no file is written."""
+    """Round the values of Gaussians as the output file does; return the Gaussians unchanged if no file is written."""
     return round_as_written(plan.output, gaussians) if plan.output else gaussians
 
 
@@ -53,8 +54,8 @@ def measure_result(
 ) -> PhotoScore | None:
     """Score Gaussians of the world, as the output file rounds them, on the scored photos; None without photos.
 
-    ``covered`` has a mask ``[h,w]`` for each scored photo, over which ``covered_psnr`` is measured. The sample of tiles
-    is then that of the input. None: over the pixels that the Gaussians themselves cover.
+    ``covered`` has a mask ``[h,w]`` for each scored photo, over which ``covered_psnr`` is measured. With ``covered``,
+    the sample has the same tiles as that of the input. None: over the pixels that the Gaussians themselves cover.
     """
     if not prepared.reference.of_views:
         return None
@@ -65,7 +66,7 @@ def measure_result(
 def measure_input(prepared: Prepared, plan: Plan) -> PhotoScore | None:
     """Score the Gaussians of the input on the scored photos, and over the pixels that they cover; None without photos.
 
-    If views have Gaussians of their own, the covered pixels are those that have one.
+    If views have Gaussians of their own, the covered pixels are those that have a Gaussian.
     """
     if not prepared.reference.of_views:
         return None
@@ -85,7 +86,7 @@ def _score_photos(
     covered: Sequence[np.ndarray] | None,
     every: int = INPUT_EVERY,
 ) -> PhotoScore:
-    """Score Gaussians of the world on the scored photos of ``views``; ``name`` is the stage whose time it takes.
+    """Score Gaussians of the world on the scored photos of ``views``, as the stage ``name``.
 
     If the plan allows samples, only one of ``every`` tiles of the photos counts.
     """
@@ -97,7 +98,7 @@ def _score_photos(
 def _measure_covered(before: PhotoScore | None, gaussians: Gaussians, prepared: Prepared, plan: Plan) -> Covered | None:
     """Return the PSNR of input and result over the pixels that the input covers; ``before`` is the input's score.
 
-    None if the input covers nearly all pixels, or if the masks of the photos leave out the others anyway.
+    None if the input covers nearly all pixels, or if the masks of the photos leave out all uncovered pixels anyway.
     """
     if before is None or compares_all_pixels(before) or prepared.scene.empty is not None:
         return None
@@ -138,7 +139,7 @@ def _measure_protected(gaussians: Gaussians, prepared: Prepared, plan: Plan) -> 
 
 @dataclass(frozen=True)
 class InputScores:
-    """Scores of an input, with which a result is compared; each is None if it cannot be measured."""
+    """Scores of an input, with which a result is compared; a score is None if it cannot be measured."""
 
     photos: PhotoScore | None  # On the scored photos
     on_files: float | None  # PSNR (dB) on the photos as they are in their files, if the run changed some

@@ -22,19 +22,20 @@ from gsmerge.types import Decoded, Gaussians, PicturedScene
 
 FOREIGN_SHARE = 0.1  # a Gaussian is at a seam if other blocks' views have more than this share of its blending weights
 SEAM_VIEW_STEPS = 2  # steps for each view
-# If at least ROOM_SHARE of all Gaussians are at seams, the blocks show the same room from all sides. Then the fit takes
-# ROOM_VIEW_STEPS steps for each view
+# If at least ROOM_SHARE of all Gaussians are at seams, the blocks show the same room from all sides. In this case the
+# fit of the seams takes ROOM_VIEW_STEPS steps for each view
 ROOM_SHARE, ROOM_VIEW_STEPS = 0.5, 4
-# Step sizes relative to those of other fits. They are smaller, because the Gaussians have been fitted before, only
-# beside other neighbours
+# Step sizes relative to those of other fits. The steps are smaller, because the fits of the blocks have already fitted
+# the Gaussians, only beside other neighbours
 SEAM_RATE = 0.6
 
 
 def fit_seams(joined: Gaussians, owners: np.ndarray, starts: Sequence[BlockStart], seed: int) -> Gaussians:
-    """Fit the Gaussians at seams again, to the photos of all blocks that show them; the others stay unchanged.
+    """Fit the Gaussians at seams again, to the photos of all blocks that show them; other Gaussians stay unchanged.
 
-    The fit of a block also changed its copies of neighbouring blocks' Gaussians, which are not in the result. At the
-    seams its Gaussians therefore do not fit those of its neighbours. ``owners [n]`` is the block of each Gaussian.
+    The fit of a block also changed the block's copies of neighbouring blocks' Gaussians, which are not in the result.
+    At the seams, a block's Gaussians therefore do not fit the Gaussians of its neighbours. ``owners [n]`` is the block
+    of each Gaussian.
     """
     plan = next((start.plan for start in starts if start.plan.fit.fit != "none"), None)
     if plan is None:
@@ -69,7 +70,7 @@ def fit_seams(joined: Gaussians, owners: np.ndarray, starts: Sequence[BlockStart
 def find_seams(
     joined: Gaussians, owners: np.ndarray, starts: Sequence[BlockStart]
 ) -> tuple[np.ndarray, list[list[int]]]:
-    """Return a mask ``[n]`` of Gaussians at seams and, for each block, those of its own views that show many of them.
+    """Return a mask ``[n]`` of Gaussians at seams and, for each block, the block's own views that show many of them.
 
     A Gaussian is at a seam if views of other blocks show it, too.
     """

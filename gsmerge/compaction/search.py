@@ -22,11 +22,12 @@ from gsmerge.stages.segment import knee_count
 # slopes, against photos and against renders of the input
 PHOTOS_SLOPE, RENDERS_SLOPE = 1.0, 3.0
 SAME_COUNT_RATIO = 1.15  # two counts are the same up to this ratio
-# A search against renders ends at a count whose PSNR is at most this many dB above the target. With RENDERS_SLOPE, such
-# a count is at most SAME_COUNT_RATIO too large
+# A search against renders ends at a count whose PSNR is at most this many dB above the target. With RENDERS_SLOPE, a
+# count at which the search ends is at most SAME_COUNT_RATIO times the least count that reaches the target
 NEAR_DB = 0.6
-# The same for a search against photos that has to keep the quality of the input. It is less than FIDELITY_LOSS, because
-# otherwise the search would end with the whole input, which loses nothing
+# A search against photos that has to keep the quality of the input ends at a PSNR at most this many dB above the
+# target. The number is less than FIDELITY_LOSS, because otherwise the search would end with the whole input, which
+# loses nothing
 PHOTOS_NEAR_DB = 0.2
 MAX_BUILDS = 6  # most builds of a search
 MAX_LEFT_OUT_BUILDS = 3  # most builds of a search by left-out photos, in addition to the build of the result
@@ -60,7 +61,7 @@ class SearchFacts:
 
 @dataclass(eq=False)
 class CountSearch:
-    """Search for the number of Gaussians: it builds one count, or several until a quality is met."""
+    """Search for the number of Gaussians: the search builds one count, or several until a quality is met."""
 
     plan: Plan  # Has the target and the limits
     first: int | None  # The count to begin with; None: as many as `superpixels` and K give
@@ -115,8 +116,8 @@ class CountSearch:
     def count(self) -> int | None:
         """The number of Gaussians that the search has chosen: that of the best candidate.
 
-        With left-out photos it is the number at which these reach the target. It may lie between those of two
-        candidates.
+        With left-out photos the number is the one at which these photos reach the target, which may lie between the
+        counts of two candidates.
         """
         if self.plan.target_psnr is None or self.left_out is None:
             return self.best.count
@@ -214,7 +215,8 @@ def add_target(plan: Plan, prepared: Prepared) -> Plan:
 def search_count(prepared: Prepared, plan: Plan, build: Build) -> CountSearch:
     """Return the search for the number of Gaussians, before its first build.
 
-    Without a quality target, the search has one count. If the scene's curve decides it, the curve is measured here.
+    Without a quality target, the search has one count. If the scene's curve decides the number, the curve is measured
+    here.
     """
     limits, left_out = plan.limits, leave_out_for_scores(prepared, plan)
     agreement, most = prepared.agreement, limits.max_count
@@ -252,7 +254,8 @@ def leave_out_for_scores(prepared: Prepared, plan: Plan) -> LeftOut | None:
 def build_left_out(build: Build, left_out: LeftOut, plan: Plan, count: int | None) -> Candidate:
     """Build a candidate from the views that remain, by a ``plan`` for them, and score it on the left-out photos.
 
-    ``count`` is the number of Gaussians for all views. The candidate has as much of it as its share of the views.
+    ``count`` is the number of Gaussians for all views. The candidate has a part of this number, in proportion to its
+    views.
     """
     assert count is not None
     begin_part()
@@ -309,7 +312,8 @@ def next_count(
         width = float(log(above / below))  # of the interval between the two counts, on a logarithmic scale
         rise = (min(psnrs[above], target + FAR_DB) - psnrs[below]) / width
         step = (target - psnrs[below]) / rise if rise > 0 else width / 2
-        # a little more than interpolated, to reach the target, and not so near to either count that it says nothing new
+        # The count is a little larger than interpolated, to reach the target, and not so near to either built count
+        # that its PSNR says nothing new
         return round(below * float(exp(min(max(step + 0.1 * width, 0.15 * width), 0.85 * width))))
     if above is None and len(psnrs) > 1:
         first, last = sorted(psnrs)[-2:]

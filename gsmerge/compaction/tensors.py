@@ -85,8 +85,8 @@ def compact_tensors(
         Ks: ``[V,3,3]`` intrinsics in pixels; the top-left pixel's centre is (0.5, 0.5).
         shape: Views, height and width; None: those of the images.
         names: Names of the views; None: numbers.
-        order: ``"view-major"``: one Gaussian per pixel, as above; ``"none"``: Gaussians without pixels
-            (trained scenes, voxels); cameras are then optional.
+        order: ``"view-major"``: one Gaussian per pixel, view after view; ``"none"``: Gaussians without pixels (trained
+            scenes, voxels); Gaussians without pixels need no cameras.
         progress: See :func:`gsmerge.compact`.
         **settings: Settings of :func:`gsmerge.compact`, such as ``budget="4%"``, ``k=2``.
 
@@ -161,7 +161,7 @@ def _combine(
 
 
 def _to_numpy(name: str, values: Any) -> np.ndarray:
-    """Return an array or tensor as a NumPy array; SceneError if it holds no numbers."""
+    """Return the argument ``name``, an array or tensor, as a NumPy array; SceneError if ``values`` holds no numbers."""
     check_numbers(name, values)
     return as_array(values)
 
@@ -177,7 +177,7 @@ def _copy_rows(name: str, values: Any, *row_shape: int) -> np.ndarray:
 
 
 def _check_gaussians(columns: dict[str, np.ndarray]) -> tuple[Gaussians, np.ndarray, list[str]]:
-    """Check columns, and make Gaussians of them; SceneError if their values have another convention.
+    """Check columns, and make Gaussians of them; SceneError if the values have another convention.
 
     The columns are changed in place: rows with NaN or infinities become transparent, opacities are cut to [0, 1], and
     quaternions get the length 1. Returns the Gaussians, a mask ``[n]`` of the rows that are finite and not empty, and
@@ -250,7 +250,7 @@ def _check_lengths(quats: np.ndarray) -> None:
 def _expect_unit_range(name: str, values: np.ndarray, slack: float) -> None:
     """Raise SceneError for colours that are more than ``slack`` outside [0, 1].
 
-    If they look like 0 to 255 or -1 to 1, the error says how to convert them.
+    If the colours look like 0 to 255 or -1 to 1, the error says how to convert them.
     """
     low, high = float(values.min(initial=0)), float(values.max(initial=0))
     if -slack <= low and high <= 1 + slack:
@@ -294,8 +294,9 @@ def _check_cameras_and_images(
 
 
 def _to_matrices(name: str, values: Any, shapes: Sequence[tuple[int, int]], views: int) -> np.ndarray:
-    """Return a float64 matrix for each view; SceneError if their number or their shape is wrong.
+    """Return a float64 matrix of the argument ``name`` for each view.
 
+    SceneError if number or shape of the matrices is wrong.
     ``views`` is the number of views, and ``shapes`` are the shapes that a matrix may have.
     """
     array = _to_numpy(name, values).astype(np.float64, order="C")
@@ -333,8 +334,8 @@ def _check_pixels(
 ) -> tuple[Cameras, list[str]]:
     """Check that Gaussians project into their pixels; return the cameras, which may be moved slightly, and notes.
 
-    Raises SceneError if they do not. If the cameras look like those of another convention or another image size, the
-    error says so.
+    Raises SceneError if Gaussians do not project into their pixels. If the cameras look like those of another
+    convention or another image size, the error says so.
     """
     pairs = sample_pixels(gaussians, cameras, valid)
     alignment = check_pairs(pairs, cameras)
@@ -376,6 +377,6 @@ def _check_seen(gaussians: Gaussians, valid: np.ndarray, cameras: Cameras, image
 
 
 def _convention_error(convention: Convention, description: str, fact: str) -> SceneError:
-    """Return the error for view matrices of another convention, with a remedy."""
+    """Return the error for view matrices of another convention, with its ``description``, a ``fact`` and a remedy."""
     problem = f"expected world-to-camera matrices with OpenCV axes, found that {fact} when the matrices are read as"
     return SceneError("viewmats", f"{problem} {description}", _REMEDIES[convention])

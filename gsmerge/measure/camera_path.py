@@ -1,4 +1,7 @@
-"""Make cameras from those of a scene: along a path for videos, or one outside the capture. All are in float64."""
+"""Make cameras from those of a scene: along a path for videos, or one outside the capture.
+
+All cameras are in float64.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +29,8 @@ PATH = re.compile(r"(?:orbit(?::(?P<turn>[^,]*))?|spline)(?:,back:(?P<back>[^,]*
 CURVE_PIECES = 64  # straight pieces of a curve between two cameras, along which its length is measured
 ORBIT_PIECES = 6 * CURVE_PIECES  # straight pieces of a whole orbit
 # Least and largest extent of an orbit, to each side and upwards, as shares of the distance to its centre. The least
-# shows few of the gaps in a scene of a single photo. The largest turns the view by 14 degrees to each side
+# extent shows few of the gaps in a scene of a single photo. The largest extent turns the view by 14 degrees to each
+# side
 HORIZONTAL, VERTICAL = (0.06, 0.25), (0.03, 0.125)
 
 
@@ -109,8 +113,8 @@ def step_back(cameras: Cameras, depth: float, back: float) -> Cameras:
 def outside_camera(cameras: Cameras, means: np.ndarray) -> tuple[Cameras, float]:
     """Make a camera outside the capture: turn the middle camera about a point in front of it, and step back.
 
-    The point is at the median depth of the ``means [n,3]``. Returns the camera, and its distance from the point in
-    world units. The fog of a result is measured from such cameras as well, see :mod:`gsmerge.measure.fog`.
+    The point is at the median depth of the ``means [n,3]``. Returns the camera, and the camera's distance from the
+    point, in world units. The fog of a result is measured from such cameras as well, see :mod:`gsmerge.measure.fog`.
     """
     back, turn = FOG_CAMERAS["turned"][-1]
     middle, depth = cameras[[median_camera(cameras)]], viewing_depth(cameras, means)
@@ -132,8 +136,8 @@ def orbit(cameras: Cameras, depth: float, count: int, turn: float | None = None)
     """Turn the middle camera about the point ``depth`` in front of it, to the sides and up and down.
 
     Frames are evenly spaced and form a loop. The picture keeps the vertical of the middle camera. ``turn`` is in
-    degrees to each side; up and down the orbit turns by half of that. By default the orbit is as wide as the median
-    offset of the cameras from the middle camera, within the limits ``HORIZONTAL`` and ``VERTICAL``.
+    degrees to each side; up and down the orbit turns by half of this angle. By default the orbit is as wide as the
+    median offset of the cameras from the middle camera, within the limits ``HORIZONTAL`` and ``VERTICAL``.
     """
     middle = median_camera(cameras)
     viewmat = cameras.viewmats[middle].astype(np.float64)
@@ -180,8 +184,8 @@ def _pose_rows(cameras: Cameras, depth: float) -> tuple[np.ndarray, np.ndarray]:
     """Return poses as rows ``[c,7]``, and a mask ``[c]`` of the poses that differ from the one before.
 
     The distance of two rows measures how much their poses differ. A row has the camera's position, and the camera's
-    quaternion times twice the depth. So a small rotation changes a row by the angle times the depth. A quaternion has
-    the sign with which it is nearer to the row before.
+    quaternion times twice the depth, so that a small rotation changes a row by the angle times the depth. A quaternion
+    has the sign with which it is nearer to the quaternion of the row before.
     """
     quats = rotmat_to_quat(cameras.viewmats[:, :3, :3].astype(np.float64).swapaxes(1, 2))
     opposite = (quats[1:] * quats[:-1]).sum(1) < 0
@@ -195,7 +199,7 @@ def _pose_rows(cameras: Cameras, depth: float) -> tuple[np.ndarray, np.ndarray]:
 def _curve(rows: np.ndarray, knots: np.ndarray, times: np.ndarray, depth: float) -> np.ndarray:
     """Evaluate a spline that passes the poses ``rows [c,7]`` at the times ``knots [c]``.
 
-    Returns its poses ``[m,7]`` at ``times [m]``.
+    Returns its poses ``[m,7]`` at ``times [m]``, as rows of :func:`_pose_rows` for ``depth``.
     """
     steps = np.diff(knots)[:, None]
     slopes = np.diff(rows, axis=0) / steps

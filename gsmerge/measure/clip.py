@@ -26,8 +26,8 @@ from gsmerge.measure.preview import FACE, BytePicture, shorten_text
 from gsmerge.settings.pictures import GIF
 from gsmerge.types import StrPath
 
-# Code and name of the encoders for each ending. The first one that OpenCV has is used. Browsers play all but MPEG-4.
-# VP8 takes a third of the time of VP9, and its files are 1.6 times as large
+# Code and name of the encoders for each ending. The first encoder that OpenCV has is used. Browsers play all but
+# MPEG-4. VP8 takes a third of the time of VP9, and its files are 1.6 times as large
 ENCODERS = {".mp4": (("vp09", "VP9"), ("mp4v", "MPEG-4")), ".webm": (("VP80", "VP8"), ("VP90", "VP9"))}
 # Name, encoder, container and options of the encoding that the program ffmpeg makes. Nearly every program plays H.264
 H264 = ("H.264", "libx264", "mp4", (
@@ -62,9 +62,9 @@ class Caption:
 def make_captions(texts: Sequence[tuple[str, str, str]], width: int, height: int) -> list[Caption]:
     """Place the captions of scenes side by side at the bottom of a frame, from left to right.
 
-    ``texts`` are the name, the count and the size of each scene. If there is room, count and size share a line.
-    Otherwise each has its own line. If the count is still too wide, it is broken between its words. A name may be
-    shortened. Other lines that do not fit are left out.
+    ``texts`` are the name, the count and the size of each scene. If there is room, count and size share a line. Without
+    this room, count and size each have their own line. A count that is too wide for its own line is broken between its
+    words. A name may be shortened. Other lines that do not fit are left out.
     """
     scale, thickness = max(0.45, height / 900), max(1, round(height / 600))
     line_height = round(LINE * scale)
@@ -102,7 +102,7 @@ def swipe_borders(count: int, frames: int, fps: float, width: int) -> list[list[
     """Return where the borders of ``count`` scenes are in each frame of a clip that is ``width`` pixels wide.
 
     Element ``[frame][i]`` is the left border of scene i, and the right border of scene i - 1: a column of pixels. The
-    inner borders begin evenly spread. They move together to the right, to the left, and back.
+    inner borders begin evenly spread. All inner borders move together to the right, to the left, and back.
     """
     swipe_seconds = 6  # time in which a border moves to both sides and back
     rounds = max(1, round(frames / fps / swipe_seconds))
@@ -132,7 +132,7 @@ def draw_swipe(pictures: Sequence[BytePicture], borders: Sequence[int], captions
 
 
 class FfmpegWriter:
-    """Writer of frames with the program ffmpeg. It has the methods of :class:`cv2.VideoWriter`."""
+    """Writer of frames with the program ffmpeg, with the methods of :class:`cv2.VideoWriter`."""
 
     def __init__(self, program: str, path: Path, shape: tuple[int, ...], fps: float) -> None:
         """Start the ``program``, which writes frames of ``shape [h,w,c]`` to a file."""
@@ -155,7 +155,7 @@ class FfmpegWriter:
 
 
 def find_ffmpeg(encoder: str) -> str | None:
-    """Find the program ffmpeg on the PATH. Returns None if it is missing, or does not have the ``encoder``."""
+    """Find the program ffmpeg on the PATH. Returns None if the program is missing, or does not have the ``encoder``."""
     program = shutil.which("ffmpeg")
     with suppress(OSError):
         if program is not None:
@@ -172,11 +172,12 @@ def stored_size(path: StrPath, width: int, height: int) -> tuple[int, int]:
 
 
 def write_clip(path: StrPath, frames: Iterable[BytePicture], fps: float, *, overwrite: bool = False) -> str:
-    """Write pictures ``[h,w,3]`` of one size as a video or a GIF; return the name of its encoding.
+    """Write pictures ``[h,w,3]`` of one size as a video or a GIF; return the name of the file's encoding.
 
-    A ``.mp4`` has the encoding H.264 if :func:`find_ffmpeg` finds a program for it, otherwise the first encoding that
-    OpenCV has. All frames of a GIF share a palette, and are in memory together. A video takes the memory of a few
-    frames. Its frames have the :func:`stored_size`: an odd side gets one more row or column, a copy of the last one.
+    A ``.mp4`` has the encoding H.264 if :func:`find_ffmpeg` finds a program for H.264, otherwise the first encoding
+    that OpenCV has. All frames of a GIF share a palette, and are in memory together. A video takes the memory of a few
+    frames. The frames of a video have the :func:`stored_size`: an odd side gets one more row or column, a copy of the
+    last one.
 
     Raises SceneError if there is no encoder for the ending of the name, or if the file cannot be written completely.
     """
@@ -224,7 +225,7 @@ def _write_gif(path: Path, frames: Sequence[BytePicture], fps: float) -> None:
     step = 1 + len(frames) * frames[0].shape[0] * frames[0].shape[1] // GIF_SAMPLE
     sample = np.concatenate([frame.reshape(-1, 3)[i % step :: step] for i, frame in enumerate(frames)])
     palette = Image.fromarray(sample[None]).quantize(256, Image.Quantize.FASTOCTREE)
-    # No dithering: it would flicker, cost 1.6 dB, and make the file a quarter larger
+    # Dithering is off, because dithered frames flicker, lose 1.6 dB, and make the file a quarter larger
     paletted = (Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames)
     first_frame, *later_frames = paletted
     first_frame.save(path, "GIF", save_all=True, append_images=later_frames, duration=round(1000 / fps), loop=0)
@@ -235,8 +236,8 @@ def _open_writer(
 ) -> tuple[cv2.VideoWriter | FfmpegWriter, str]:
     """Open the file ``temporary`` with the first available encoder; return the writer, and the encoding's name.
 
-    All frames have ``shape``. ``path`` is the name that the file will get: its ending decides about the encoders, and
-    messages name it.
+    All frames have ``shape``. ``path`` is the name that the file will get: the ending of ``path`` decides about the
+    encoders, and messages name ``path``.
     """
     height, width, _ = shape
     name, encoder, container, _ = H264

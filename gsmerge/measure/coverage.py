@@ -13,14 +13,15 @@ from gsmerge.types import Gaussians, Scene
 
 
 def extents(gaussians: Gaussians) -> dict[str, Any]:
-    """Measure positions and sizes of Gaussians with finite values, in world units; on a sample if there are many.
+    """Measure positions and sizes of Gaussians with finite values, in world units.
 
+    Many Gaussians are measured on a sample.
     Returns:
         ``box_low`` and ``box_high``: percentiles 1 and 99 of the positions, for each axis. ``diagonal``: length of this
         box's diagonal. ``share_outliers``: share of positions outside the box enlarged ten times. ``share_floaters``:
         share of isolated Gaussians and outliers. ``scale_median``: median of the Gaussians' largest scales.
         ``scale_max``: largest scale of all. ``share_huge``: share of Gaussians whose largest scale is above a tenth of
-        the diagonal. All are 0 if there are no Gaussians.
+        the diagonal. All figures are 0 if there are no Gaussians.
     """
     names = ("diagonal", "share_outliers", "share_floaters", "scale_median", "scale_max", "share_huge")
     if len(gaussians) == 0:
@@ -41,9 +42,9 @@ def extents(gaussians: Gaussians) -> dict[str, Any]:
 def coverage(scene: Scene) -> list[dict[str, Any]]:
     """Measure how much of each view the Gaussians cover. If a photo has two layers, each layer is a view.
 
-    Returns three entries for each view. ``name`` is its name. ``share_of_pixels`` is the share of the pixels that have
-    a visible Gaussian of their own, or None if the scene does not have one Gaussian per pixel. ``share_of_gaussians``
-    is the share of all Gaussians whose mean is inside the picture.
+    Returns three entries for each view. ``name`` is the view's name. ``share_of_pixels`` is the share of the pixels
+    that have a visible Gaussian of their own, or None if the scene does not have one Gaussian per pixel.
+    ``share_of_gaussians`` is the share of all Gaussians whose mean is inside the picture.
     """
     if len(scene) == 0:
         return []
@@ -61,7 +62,10 @@ def coverage(scene: Scene) -> list[dict[str, Any]]:
 
 
 def shares_inside(scene: Scene, most: int) -> list[float]:
-    """Return, for each view, the share of the Gaussians whose means are inside it. At most ``most`` are tested."""
+    """Return, for each view, the share of the Gaussians whose means are inside the view.
+
+    At most ``most`` Gaussians are tested.
+    """
     rows = np.arange(0, scene.num_gaussians, max(1, -(-scene.num_gaussians // most)))
     points = scene.file_gaussians.means[rows].astype(np.float64)
     return [float(inside.mean()) if len(points) else 0.0 for inside in inside_views(points, scene.cameras)]

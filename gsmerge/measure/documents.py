@@ -40,7 +40,7 @@ def note_entries(notes: Iterable[str]) -> dict[str, Any]:
 
 
 def note_lines(notes: Iterable[str]) -> list[str]:
-    """Return a line for each note. It begins with "warning" if the note is a doubt, and otherwise with "note"."""
+    """Return a line for each note, which begins with "warning" if the note is a doubt, and otherwise with "note"."""
     return [f"{'warning' if isinstance(note, Doubt) else 'note':11}{note}" for note in notes]
 
 
@@ -81,9 +81,10 @@ def text_table(
 ) -> list[str]:
     """Format rows as lines of text, with the first column left-aligned and the others right-aligned.
 
-    ``letters`` is the width of the terminal; None: unlimited. A table that is too wide is reduced until it fits. First
-    the columns with the numbers ``omitted_first`` are left out, in this order. Then the texts of the first column are
-    shortened to ``MIN_NAME``. Then other columns are left out from the last on, except the first two.
+    Each line begins with ``indent``. ``letters`` is the width of the terminal; None: unlimited. A table that is too
+    wide is reduced until it fits. The columns with the numbers ``omitted_first`` are left out first, in this order. The
+    texts of the first column are shortened to ``MIN_NAME`` next. Other columns, except the first two, are left out at
+    the end, from the last on.
     """
     max_width = 10_000  # width of a table that is not printed on a terminal
     widths, room = [max(map(len, column)) for column in zip(*rows, strict=True)], (letters or max_width) - len(indent)

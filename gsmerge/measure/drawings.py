@@ -103,7 +103,7 @@ class Drawing:
 
 @dataclass(frozen=True, eq=False)
 class DrawnScenes:
-    """Scenes to draw together. All are in the frame of one scene, and are drawn in its views."""
+    """Scenes to draw together. All scenes are in the frame of one scene, and are drawn in the views of this scene."""
 
     scenes: list[tuple[Path, Gaussians]]
     sizes: list[int]  # bytes of their files
@@ -144,8 +144,8 @@ class DrawnScenes:
 def frame_files(files: SceneFiles, cameras: StrPath | None, images: StrPath | None) -> SceneFiles:
     """Find the files of the scene that defines the frame of the cameras.
 
-    For a compacted scene this is its source ``NAME.ply``, if that lies beside it. Otherwise it is the scene itself.
-    ``cameras`` and ``images`` are the options of the user.
+    For a compacted scene this is its source ``NAME.ply``, if that lies beside it. For any other scene it is the scene
+    itself. ``cameras`` and ``images`` are the options of the user.
     """
     match = re.fullmatch(r"(.+)\.compact(\.level\d+)?(\.compressed)?\.(ply|spz|sog|splat|glb)", files.ply.name)
     if match is None or not (source := files.ply.with_name(f"{match[1]}.ply")).is_file():
@@ -288,8 +288,9 @@ DRAWINGS = {"panel": prepare_panel, "views": prepare_pictures, "path": prepare_c
 
 
 def _read_scenes(options: DrawOptions, *, photos: bool) -> DrawnScenes:
-    """Read the scenes, and the cameras of ``options.framing``, which show them; if ``photos``, also read its photos.
+    """Read the scenes, and the cameras of ``options.framing``, which show them.
 
+    If ``photos``, also read photos of the framing.
     If there are no cameras, views are placed around the scene, and if ``photos`` also inside it.
     """
     files, framing, paths = options.files, options.framing, options.paths
@@ -337,8 +338,8 @@ def find_view(view: str, names: Sequence[str]) -> int:
 def picture_stems(names: Sequence[str]) -> list[str]:
     """Choose a file name without ending for each view, all different.
 
-    The names of the images are used if all differ, otherwise whole paths joined by ``_``. If these are equal as well,
-    views are numbered.
+    The names of the images are used if all differ, otherwise whole paths joined by ``_``. If whole paths are equal as
+    well, views are numbered.
     """
     paths = []
     for name in names:

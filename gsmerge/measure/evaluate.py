@@ -62,8 +62,8 @@ class ViewScore:
     visible: float  # share of the pixels that the input views have seen
     full: Quality  # over all pixels
     masked: Quality  # over the pixels that the input views have seen (supplement A)
-    # Share of the pixels that the input covers: they have a Gaussian of their own, or an opacity above a half. None if
-    # the input was not measured
+    # Share of the pixels that the input covers, because these have a Gaussian of their own, or an opacity above a half.
+    # None if the input was not measured
     covered_share: float | None = None
     covered: Quality = Quality()  # PSNR and SSIM over these pixels
 
@@ -92,7 +92,7 @@ class ResultScores:
         return _average([score.full for score in views]), _average([score.masked for score in views])
 
     def mean_covered(self, split: str) -> tuple[float | None, Quality]:
-        """Return two means over a split's views: the share of the pixels that the input covers, and their scores."""
+        """Return means over a split's views: the share of pixels that the input covers, and these pixels' scores."""
         views = self._select_views(split)
         shares = [score.covered_share for score in views if score.covered_share is not None]
         return float(np.mean(shares)) if shares else None, _average([score.covered for score in views])
@@ -133,7 +133,7 @@ class Evaluation(ArrayFields):
 
     @property
     def doubts(self) -> list[str]:
-        """The notes that warn: of a result that is worse than the input, or of figures that may mislead."""
+        """The notes that warn of a result that is worse than the input, or of figures that may mislead."""
         return list_doubts(self.notes)
 
     def __repr__(self) -> str:
@@ -172,7 +172,7 @@ class _Split:
 
 @dataclass(frozen=True, eq=False)
 class _Renderer:
-    """Renderer of views. It has the same settings for all scenes, so that equal Gaussians give equal images."""
+    """Renderer of views, with the same settings for all scenes, so that equal Gaussians give equal images."""
 
     near: float  # near plane, world units
     options: EvaluateOptions
@@ -206,15 +206,15 @@ def evaluate(
         targets: Held-out views in that world, see :func:`gsmerge.scene.held_out.read_held_out`.
         options: Settings; None: the defaults, with LPIPS if its weights are installed.
         cameras: Cameras of the input views, by name of a result, if the result was made with other poses than the
-            scene has. They are ``CompactResult.cameras``.
+            scene has. A result has these cameras as ``CompactResult.cameras``.
         progress: Called with (name of the step, number done, total); the step of a result is "evaluate: NAME".
         on_image: Called with (result, split, number of the view in the split, render ``[h,w,3]`` in [0, 1]).
 
     Raises:
         SceneError: If the scene has values of another convention, such as log scales.
         UsageError: If the scene has no views, or if a result has the name "input".
-        GsmergeError: If ``options`` ask for LPIPS and its weights are not installed. Without ``options`` LPIPS is then
-            left out, with a note.
+        GsmergeError: If ``options`` ask for LPIPS and its weights are not installed. Without ``options``, LPIPS whose
+            weights are not installed is left out, with a note.
 
     Example:
         >>> scene = gsmerge.read_scene("demo")
@@ -298,7 +298,7 @@ def _describe_scores(splits: Mapping[str, _Split], scores: Sequence[ResultScores
     """Yield notes on results that are clearly worse than the input, and on figures that may mislead.
 
     ``mended`` is True if compact changes the photos before it fits a scene to them. Scores use the unchanged photos, so
-    a result may then differ from them for a good reason.
+    a result that was fitted to changed photos may differ from the unchanged photos for a good reason.
     """
     photos = "context" in splits and splits["context"].reference == PHOTOS
     psnrs = {score.name: score.mean("context")[0].psnr for score in scores}
@@ -362,8 +362,8 @@ def _score_split(
 ) -> dict[str, list[tuple[float, ViewScore]]]:
     """Draw and score all results, one view after the other.
 
-    Returns, for each result, the seconds of drawing and the score of each view. ``cameras`` has the cameras of the
-    results that were made with other poses than the scene has.
+    Returns, by the name of each result, the seconds of drawing and the score of each view. ``kind`` is the name of the
+    split. ``cameras`` has the cameras of the results that were made with other poses than the scene has.
     """
     options, names = renderer.options, split.views.names
     lpips_views = pick_views(len(names), options.lpips_views or len(names))

@@ -1,9 +1,9 @@
 """Measure fog, veils, holes and spikes: errors of a compact scene that only show from outside the views.
 
-Photos score a scene from their own viewpoints only, but a person who views the scene first steps back and turns. Then
-Gaussians in gaps between the views show as haze, and Gaussians of wrong depth as veils before surfaces. Gaps in
-surfaces show as holes. Long thin Gaussians, which look like texture in one view, show as strokes. Photos are not
-needed, only the input and the cameras of its views. docs/guide/evaluate.md explains the figures to users.
+Photos score a scene from their own viewpoints only, but a person who views the scene first steps back and turns. From
+outside, Gaussians in gaps between the views show as haze, and Gaussians of wrong depth show as veils before surfaces.
+Gaps in surfaces show as holes. Long thin Gaussians, which look like texture in one view, show as strokes. Photos are
+not needed, only the input and the cameras of its views. docs/guide/evaluate.md explains the figures to users.
 """
 
 from __future__ import annotations
@@ -24,19 +24,20 @@ from gsmerge.runtime.record import Progress
 from gsmerge.types import Cameras, Gaussians
 
 VIEWS = 3  # evenly spread input views from which the cameras start
-# Cameras by kind. Each steps back from an input view, by a share of the view's median depth. Then it turns about the
-# point in the view's middle, by degrees
+# Outside cameras by kind, as pairs of a share and an angle. A camera steps back from an input view, by this share of
+# the view's median depth. Then the camera turns about the point in the view's middle, by this angle in degrees
 FOG_CAMERAS = {"back": ((0.5, 0), (1.5, 0)), "turned": ((0.5, -30), (0.5, 30))}
 ALL = "all"  # kind that stands for all of these cameras
 FOG_PIXELS = 480  # longer side of the pictures is at most this, pixels
-# Opacities. The input is empty below FOG_EMPTY and solid above FOG_SOLID. A solid pixel of the input is a hole of a
-# result whose opacity is below FOG_OPEN there
+# A pixel of the input is empty if its opacity is below FOG_EMPTY, and solid if its opacity is above FOG_SOLID. A solid
+# pixel of the input is a hole of a result if the result has an opacity below FOG_OPEN in this pixel
 FOG_EMPTY, FOG_SOLID, FOG_OPEN = 0.05, 0.9, 0.5
 EROSION_PIXELS = 17  # side, in pixels, of the square that erodes empty regions
 VEIL_SHARE = 0.7  # a result has a veil where its depth is below this share of the input's depth
 VEILED = 0.08  # share of the pixels; a result whose worst veil is larger gets a note
 # A spike is a Gaussian whose longest scale is at least RATIOS times the second one, and whose length at 3 sigma is more
-# than LONG of the picture's width. It is visible where a channel changes by more than CHANGED without it
+# than LONG of the picture's width. A spike is visible where a channel changes by more than CHANGED if the spike is
+# removed
 RATIOS, LONG, CHANGED = (5.0, 3.0), 0.05, 0.05
 FOG_NEAR_PLANE = 0.25  # near plane of the depths of both scenes, as a share of the view's median depth
 
@@ -52,11 +53,11 @@ class Fog:
         fog_far: Mean opacity of the pixels that are farther than a tenth of the width from all that the input shows.
         holes: Share of the pixels with a solid input in which the result has an opacity below a half.
         veil: Share of the pixels with a solid input in which the depth of the result is less than 0.7 of the input's
-            depth. It is a mean over the cameras.
+            depth. This share is a mean over the cameras.
         veil_worst: The largest veil of a single camera.
         spikes: Share of the pixels that change visibly if all spikes are removed. A spike is longer than 5 % of the
             width, and at least five times as long as its second axis.
-        strokes: The same share, if a spike is at least three times as long as its second axis.
+        strokes: Like ``spikes``, but with spikes that are at least three times as long as their second axis.
     """
 
     fog_near: float | None = None
@@ -182,7 +183,8 @@ def mean_fog(sums: np.ndarray) -> Fog:
     """Make the figures of a :class:`Fog` from ``sums [pictures,6,2]`` of several pictures.
 
     A picture has the four rows of :func:`sum_pixels`, and the two rows of :func:`count_spikes`. A figure is the sum
-    over all pictures, divided by the number of their pixels. Veils are divided in each picture, and then averaged.
+    over all pictures, divided by the number of these pictures' pixels. For veils, each picture's sum is divided by the
+    picture's pixels, and the shares are then averaged.
     """
     near, far, holes, _, *spikes = (total / count if count else None for total, count in sums.sum(0).tolist())
     veils = [total / count for total, count in sums[:, 3].tolist() if count]

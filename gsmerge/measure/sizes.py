@@ -19,7 +19,10 @@ SomeViews = TypeVar("SomeViews", bound=Views)
 
 
 def shrink_cameras(cameras: Cameras, side: int) -> Cameras:
-    """Shrink the image size of cameras to at most ``side`` pixels on the longer side. If ``side`` is 0, it stays."""
+    """Shrink the image size of cameras to at most ``side`` pixels on the longer side.
+
+    If ``side`` is 0, the size stays.
+    """
     size = cameras.width, cameras.height
     smaller = limit_size(size, side or max(size))
     return cameras if smaller == size else resize_cameras(cameras, *smaller)
@@ -38,7 +41,10 @@ def fill_cameras(cameras: Cameras, width: int, height: int) -> Cameras:
 
 
 def fill_photo(photo: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Resize and crop a photo ``[h,w,3]`` to ``[height,width,3]``; :func:`fill_cameras` changes its camera likewise."""
+    """Resize and crop a photo ``[h,w,3]`` to ``[height,width,3]``.
+
+    :func:`fill_cameras` changes the photo's camera likewise.
+    """
     new_width, new_height = _filling_size(photo.shape[1], photo.shape[0], width, height)
     top, left = (new_height - height) // 2, (new_width - width) // 2
     return resize_photo(photo, new_width, new_height)[top : top + height, left : left + width]
@@ -51,7 +57,10 @@ def _filling_size(old_width: int, old_height: int, width: int, height: int) -> t
 
 
 def shrink_views(views: SomeViews, side: int) -> SomeViews:
-    """Shrink photos and cameras to at most ``side`` pixels on the longer side. If ``side`` is 0, they stay."""
+    """Shrink photos and cameras to at most ``side`` pixels on the longer side.
+
+    If ``side`` is 0, both keep their size.
+    """
     cameras = shrink_cameras(views.cameras, side)
     if cameras is views.cameras:
         return views
@@ -61,7 +70,7 @@ def shrink_views(views: SomeViews, side: int) -> SomeViews:
 
 
 def resize_photo(photo: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Resize a photo ``[h,w,3]``: area averages shrink it, cubic interpolation enlarges it."""
+    """Resize a photo ``[h,w,3]``: area averages shrink photos, cubic interpolation enlarges photos."""
     if width * height < photo.shape[0] * photo.shape[1]:
         resized = cv2.resize(photo, (width, height), interpolation=cv2.INTER_AREA)
     else:
@@ -82,7 +91,8 @@ def resize_mask(mask: NDArray[np.bool_], width: int, height: int) -> NDArray[np.
 def _overlapped_range(old: int, new: int) -> tuple[np.ndarray, np.ndarray]:
     """Return which pixels of a line of ``old`` pixels each pixel overlaps after the line is resized to ``new`` pixels.
 
-    Two arrays ``[new]`` have the first old pixel, and the one after the last.
+    The first array ``[new]`` has the first overlapped old pixel, and the second array ``[new]`` the old pixel after the
+    last overlapped one.
     """
     pixel = np.arange(new)
     return pixel * old // new, -(-(pixel + 1) * old // new)

@@ -23,8 +23,8 @@ _CHUNK = 1 << 16  # number of points that are processed at a time; often the fir
 def context_points(scene: Scene, near: float, cameras: Cameras | None = None) -> Points:
     """Return the surface points ``[n,3]``, in world units, that the pixels of the input views show.
 
-    If each view has Gaussians of its own, the points are the means of these Gaussians. Otherwise the points follow from
-    depths, rendered beyond ``near`` (world units) in ``cameras``. By default these are the scene's cameras.
+    If each view has Gaussians of its own, the points are the means of these Gaussians. If not, the points follow from
+    depths, rendered beyond ``near`` (world units) in ``cameras``. None: the scene's cameras.
     """
     if scene.has_own_pixels:
         return scene.file_gaussians.means.astype(np.float64)
@@ -72,7 +72,7 @@ def visible_pixels(points: Points, cameras: Cameras, near: float, sources: Camer
 def _choose_mark_side(K: np.ndarray, sources: Cameras | None) -> int:
     """Choose the side of the square that a point marks in a view with intrinsics ``K [3,3]``: an odd number of pixels.
 
-    The square covers the same angle as ``min_side`` pixels of ``sources``, if that is larger.
+    The square covers the same angle as ``min_side`` pixels of ``sources``, if this makes the square larger.
     """
     min_side = 3  # least side of the square, pixels
     if sources is None:

@@ -87,8 +87,9 @@ class ViewData:
     def start(self) -> int:
         """Index of the view with which the page opens.
 
-        It is the view with the median score, or the first one if no view has scores. Only held-out views are considered
-        if there are any, and of these only views with LPIPS if there are any.
+        The page opens with the view of the median score, or with the first view if no view has scores. Only held-out
+        views are considered if a page has held-out views. If some of the considered views have LPIPS, only views with
+        LPIPS are considered.
         """
         views = list(enumerate(self.views))
         held_out = [(i, view) for i, view in views if view.held_out] or views
@@ -129,7 +130,7 @@ def collect_page_data(
     stills: Stills = {}
 
     def add_still(result: str, split: str, view: int, image: np.ndarray) -> None:
-        """Keep a rendered view as an encoded still."""
+        """Keep the render ``[h,w,3]`` of a view of a split as an encoded still."""
         stills[result, split, view] = encode_still(to_picture(image))
 
     options = EvaluateOptions((LPIPS,) if lpips_available(LPIPS) else (), None, fog=False)
@@ -223,7 +224,7 @@ def _list_views(
 
 
 def _draw_outside_view(scene: Scene, named: Mapping[str, Gaussians], frame: Frame, place: int) -> PageView:
-    """Draw the scene and its results from outside the capture.
+    """Draw the scene and its results from outside the capture, as view ``place`` of the page.
 
     ``named`` are the Gaussians of the scene and of the results, in the scene's world.
     """
@@ -284,7 +285,7 @@ def _collect_side(
     *,
     light: bool,
 ) -> Side:
-    """Collect the data of one side of a page: scores and packed Gaussians.
+    """Collect the data of one side of a page: mean scores over ``split``, and packed Gaussians.
 
     ``gaussians`` and ``cameras`` are in the canonical frame.
     """
@@ -305,10 +306,10 @@ def _collect_side(
 
 
 def _choose_shown(views: Sequence[PageView]) -> tuple[PageView, ...]:
-    """Choose ``MAX_SHOWN_VIEWS`` views and the worst view; return them worst first."""
+    """Choose ``MAX_SHOWN_VIEWS`` views and the worst view; return these views, the worst first."""
 
     def quality(view: PageView) -> float:
-        """Return a view's PSNR of the first result, or of the scene if it is alone; infinity if it was not measured."""
+        """Return a view's PSNR of the first result, or of a scene without results; infinity if there is no PSNR."""
         psnr = view.scores[min(1, len(view.scores) - 1)].psnr
         return np.inf if psnr is None else psnr
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 # Content security policy: a page may run only its own scripts and styles, which the policy names by their hashes
 PICTURES_POLICY = "default-src 'none'; img-src data:; style-src {style}; script-src {script}"
-# The 3D viewer Spark needs WebAssembly and a worker. Its script holds both, as data: and blob: addresses
+# The 3D viewer Spark needs WebAssembly and a worker. The viewer's script holds both as data: and blob: addresses
 SOLID_POLICY = f"{PICTURES_POLICY} blob: 'wasm-unsafe-eval'; worker-src data: blob:; connect-src data: blob:"
 POLICY_MARK = "{policy}"  # placeholder in the templates until the hashes are known
 VIEWER = Path(__file__).parent / "vendor/spark-three.js.gz"
@@ -141,7 +141,7 @@ def _closer_or_farther(gain: float) -> str:
 
 
 def agreement_words(data: ViewData) -> str:
-    """Describe the share of the depth that other views confirm, or say what would help if the share is small."""
+    """Describe the share of the depth that other views confirm, or say what would raise a small share."""
     if data.agreement is None:
         return ""
     return data.agreement.advice or f"{100 * data.agreement.confirmed:.0f} % of the depth is confirmed by other views"
@@ -155,7 +155,10 @@ def speed(data: ViewData, side_id: int = 1) -> float | None:
 
 
 def speed_words(ratio: float | None) -> str:
-    """Return the end of the headline, which says how much faster a result is drawn; "" if it is not clearly faster."""
+    """Return the end of the headline, which says how much faster a result is drawn.
+
+    Returns "" if the result is not clearly faster.
+    """
     min_ratio = 1.2  # the headline mentions a ratio of drawing times from this value on
     if ratio is None or ratio < min_ratio:
         return ""
@@ -211,7 +214,8 @@ def list_figures(data: ViewData, side_id: int) -> list[Figure]:
 def _score_figure(label: str, name: str, old: float | None, new: float | None, *, own: bool, is_result: bool) -> Figure:
     """Make the figure of a mean score, which is ``old`` for the scene itself and ``new`` for one side of the page.
 
-    ``own`` is True if scores are over the photos of the fit. ``is_result`` is True if the side is not the scene itself.
+    ``label`` is shown, and ``name`` is the metric. ``own`` is True if scores are over the photos of the fit.
+    ``is_result`` is True if the side is not the scene itself.
     """
     digits, unit = (2, " dB") if name == "psnr" else (3, "")
     is_better = is_result and old is not None and new is not None and old < new
@@ -288,7 +292,7 @@ def _round_finite(value: float | None) -> float | None:
 
 
 def data_uri(content: bytes, kind: str) -> str:
-    """Encode content as a ``data:`` address."""
+    """Encode content of the media type ``kind`` as a ``data:`` address."""
     return f"data:{kind};base64,{base64_text(content)}"
 
 
@@ -298,10 +302,10 @@ def base64_text(content: bytes) -> str:
 
 
 def render_template(name: str, policy: str, **values: Any) -> str:
-    """Fill a template with values, which are escaped unless the template says otherwise.
+    """Fill the template file ``name`` with values, which are escaped unless the template says otherwise.
 
-    ``policy`` is the page's content security policy. Its ``{script}`` and ``{style}`` become the hashes of the page's
-    scripts and styles.
+    ``policy`` is the page's content security policy. The policy's ``{script}`` and ``{style}`` become the hashes of the
+    page's scripts and styles.
     """
     text = _environment().get_template(name).render(version=__version__, **values)
     text = text.encode("utf-8", "replace").decode("utf-8")  # names of files may have lone surrogates
@@ -310,7 +314,7 @@ def render_template(name: str, policy: str, **values: Any) -> str:
 
 
 def _hashes(page: str, kind: str) -> list[str]:
-    """Return the hashes of a page's own scripts or styles, as a content security policy names them."""
+    """Return hashes of a page's "script" or "style" elements (``kind``), as a content security policy names them."""
     # Elements with a type attribute hold data, which a browser does not run
     contents = re.findall(f"<{kind}>(.*?)</{kind}>", page, re.DOTALL)
     digests = [hashlib.sha256(content.encode()).digest() for content in contents]

@@ -1,4 +1,4 @@
-"""Write a page that contains a viewer and a ``.sog``; its camera stays near the viewpoints of the photos."""
+"""Write a page that contains a viewer and a ``.sog``; the viewer's camera stays near the viewpoints of the photos."""
 
 from __future__ import annotations
 
@@ -32,7 +32,10 @@ LICENSED = ("spark", "three", "fflate")  # parts of the viewer that have a licen
 
 
 def write_output(add: AddOutput, path: Path, page: Path, contents: Contents) -> dict[Path, list[Path]]:
-    """Write the page of a result. The table of formats calls it as :data:`gsmerge.io.formats.table.WriteOutput`."""
+    """Write the page of a result.
+
+    The table of formats calls this function as :data:`gsmerge.io.formats.table.WriteOutput`.
+    """
     page.write_bytes(make_page(contents.levels[0], contents.cameras, contents.title, contents.comments).encode())
     return {path: [page]}
 

@@ -29,16 +29,16 @@ def pack_splats(
 ) -> tuple[bytes | None, int]:
     """Pack the visible Gaussians with as many harmonics as fit; return the bytes and the degree of these harmonics.
 
-    The bytes are None, and the degree 0, if there are more than ``MAX_GAUSSIANS``.
+    If there are more than ``MAX_GAUSSIANS``, the bytes are None, and the degree is 0.
 
-    The page's script unpacks the bytes to a ``.spz``. They are a gzip stream of a line of JSON and of columns. A column
-    has one number of each Gaussian, as the difference from the Gaussian before. The lowest bit is the sign. All low
-    bytes of a column come first, then the higher bytes. Neighbouring rows are similar, so the bytes take 40 to 70 % of
-    the ``.spz``.
+    The page's script unpacks the bytes to a ``.spz``. The bytes are a gzip stream of a line of JSON and of columns. A
+    column has one number of each Gaussian, as the difference from the Gaussian before. The lowest bit of a number is
+    the sign. All low bytes of a column come first, then the higher bytes. Neighbouring rows are similar, so the bytes
+    take 40 to 70 % of the ``.spz``.
 
     ``homes [n]`` is the pixel of each Gaussian, numbered over the pictures of all ``cameras``, or -1. If all Gaussians
-    have one, a depth and a shift within the pixel are stored in place of a position. ``gaussians`` and ``cameras`` are
-    in the page's frame. The scene has a size of about 1 in this frame, since browsers keep means in 16 bits.
+    have a pixel, a depth and a shift within the pixel are stored in place of a position. ``gaussians`` and ``cameras``
+    are in the page's frame. The scene has a size of about 1 in this frame, since browsers keep means in 16 bits.
     """
     rows, means = drawn_rows(gaussians), np.ascontiguousarray(gaussians.means, np.float32)
     count = len(rows)

@@ -83,7 +83,7 @@ def view(
         results: Results of the scene by name, or one result: from :func:`gsmerge.compact`, Gaussians, or paths of
             files.
         held_out: Views with photos that were not part of the input, for scores.
-        light: Show the scene itself in stills only; None: if it has more than 600,000 Gaussians.
+        light: Show the scene itself in stills only; None: in stills only if it has more than 600,000 Gaussians.
         progress: Called with (name of the step, number done, total).
 
     Returns:

@@ -1,1 +1,1 @@
-"""Tools for research: synthetic scenes, training, charts, stress tests. Only the command line imports them."""
+"""Tools for research: synthetic scenes, training, charts, stress tests. Only the command line imports these tools."""

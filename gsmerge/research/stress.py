@@ -1,7 +1,7 @@
 """Compact a scene under bad conditions: with worse views, poses, photos or rows.
 
 A case defines how a scene is changed, which scenes it applies to, and the property that must hold. A change returns a
-new scene. If it moves the world, it also moves the held-out views.
+new scene. A change that moves the world also moves the held-out views.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def keep_views(setup: StressScene, choose: Callable[[int], Sequence[int]]) -> St
 def scale_and_shift(setup: StressScene, factor: float, shift: Sequence[float]) -> StressScene:
     """Scale the world by ``factor``, then shift it by ``shift`` times the size that the scene has after scaling."""
     scene, views = setup.scene, setup.views
-    # The scene is moved from this frame to the world
+    # ``frame`` is the frame in which the scene stands before it is moved to the world
     frame = Frame(np.array(shift, np.float64) * scene_frame(scene).unit * factor, factor)
     scene = replace(scene, gaussians=frame.leave(scene.gaussians), cameras=frame.leave_cameras(scene.cameras))
     return StressScene(scene, views and replace(views, cameras=frame.leave_cameras(views.cameras)))
@@ -92,7 +92,10 @@ def change_exposure(setup: StressScene, share: float) -> StressScene:
 
 
 def break_rows(setup: StressScene) -> StressScene:
-    """Remove 1 % of the rows at random, but at least one. The reader removes rows with NaN in the same manner."""
+    """Remove 1 % of the rows at random, but at least one.
+
+    Scenes can lack rows, because the reader of files removes rows with NaN.
+    """
     count = len(setup.scene.gaussians)
     broken_share = 0.01  # share of the rows that are removed
     broken = np.random.default_rng(SEED).choice(count, max(1, round(broken_share * count)), replace=False)
@@ -168,8 +171,9 @@ def stress(
 ) -> tuple[StressOutcome, ...]:
     """Compact a scene under bad conditions, all ``CASES`` or the named ones, and check each result.
 
-    Results are scored on the held-out views ``targets`` if there are any. Otherwise they are scored on the photos of
-    the input views, or on renders of the input if it has no photos. ``progress`` is called with (case, done, total).
+    Results are scored on the held-out views ``targets`` if there are any. Without ``targets``, results are scored on
+    the photos of the input views, or on renders of the input if it has no photos. ``progress`` is called with (case,
+    done, total).
 
     Raises:
         UsageError: If a case is unknown, or the scene has no views.
@@ -246,7 +250,8 @@ def _fit_slack(options: CompactOptions) -> float:
 def _check_result(case: Case, base: _ScoredResult, result: _ScoredResult, slack: float) -> tuple[bool, str]:
     """Compare a result with its own input, or with the result ``base`` of the unchanged scene, as the case requires.
 
-    Returns True if the property of the case holds, and the compared figures.
+    Returns True if the property of the case holds, and the compared figures. ``slack`` is how many dB more a result may
+    lose because of its fit.
     """
     figures = f"{len(result.gaussians):,} Gaussians, {result.after:.2f} dB"
     with_base = f"{figures}; unchanged {len(base.gaussians):,}, {base.after:.2f} dB"
@@ -265,7 +270,7 @@ def _check_result(case: Case, base: _ScoredResult, result: _ScoredResult, slack:
 def _check_again(setup: StressScene, base: _ScoredResult, options: CompactOptions) -> tuple[bool, str]:
     """Compact the result ``base`` a second time without reducing it, and check that the quality stays.
 
-    Returns True if it stays, and the PSNR after and before.
+    Returns True if the quality stays, and the PSNR after and before the second run.
     """
     scene = setup.scene
     unaligned = Scene(base.gaussians, scene.cameras, scene.images, None, scene.names)

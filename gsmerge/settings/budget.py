@@ -86,7 +86,7 @@ class BudgetOptions(Settings):
 
     @property
     def number(self) -> int | None:
-        """The number of Gaussians if the budget is a number; None for any other budget, or without one."""
+        """The number of Gaussians if the budget is a number; None for any other budget, or without a budget."""
         if self.budget is None or self.auto or self.in_bytes or self.budget in DEVICES or "%" in str(self.budget):
             return None
         return parse_budget(self.budget, sys.maxsize)
@@ -127,7 +127,10 @@ def parse_quality(text: str) -> float:
 
 
 def parse_share(text: str) -> float:
-    """Parse a share such as "4.4%" into a number such as 0.044; ValueError unless it is above 0 and at most 1."""
+    """Parse a share such as "4.4%" into a number such as 0.044.
+
+    Raises ValueError unless the share is above 0 and at most 1.
+    """
     match = re.fullmatch(r"(\d*\.?\d+)\s*%", str(text).strip(), re.ASCII)
     share = Fraction(match[1]) / 100 if match else Fraction(0)
     if not 0 < share <= 1:

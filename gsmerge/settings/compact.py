@@ -1,6 +1,6 @@
 """Declare all settings of a run.
 
-They are grouped by stage. Users give each setting by its flat name, which is its name without the group.
+Settings are grouped by stage. Users give each setting by its flat name, which is its name without the group.
 """
 
 from __future__ import annotations
@@ -28,8 +28,9 @@ OURS = "gsmerge"  # name of the built-in method; all others are plugins
 EFFORT_NAMES = ("draft", "fast", "default", "best")  # gsmerge.plan.EFFORTS has the settings of each
 CHECKPOINTS = ("auto", "shipped", "paper", "none")  # values of `checkpoint` that are not paths of files
 # A recipe stands for several settings. Settings that a user also gives take precedence. "paper" is the method of the
-# superpixel merging paper: it cuts 476 x 476 pixels into 12,000 superpixels by BASS, from saliency seeds. It uses
-# networks with absolute outputs, matches by latents and boxes, does not fit, and prunes by opacity only
+# superpixel merging paper: this recipe cuts 476 x 476 pixels into 12,000 superpixels by BASS, from saliency seeds. The
+# recipe "paper" uses networks with absolute outputs, matches by latents and boxes, does not fit, and prunes by opacity
+# only
 RECIPES: Mapping[str, Mapping[str, Any]] = {
     "paper": {
         "superpixels": "5.3%", "segmentation": "bass-st", "match": "aabb", "fit": "none", "min_contribution": 0.0,
@@ -38,7 +39,8 @@ RECIPES: Mapping[str, Mapping[str, Any]] = {
 }  # fmt: skip
 # Settings that decide the number of Gaussians
 COUNTS = ("superpixels", "k", "budget")
-# Settings of a run on a part of a scene, such as a block of views. Their usual values would need the whole scene
+# Settings of a run on a part of a scene, such as a block of views. The usual values of these settings would need the
+# whole scene
 ONE_PIECE: dict[str, Any] = {"poses": "fixed", "exposure": "fixed", "blocks": "none", "new_views": False}
 # Settings of a trial, which is a short run on some of the views
 TRIAL: dict[str, Any] = {
@@ -126,7 +128,10 @@ class CompactOptions(Settings):
 
     @property
     def changes_superpixels(self) -> bool:
-        """True if any setting changes how superpixels are cut, merged or decoded; their number does not count."""
+        """True if any setting changes how superpixels are cut, merged or decoded.
+
+        The number of superpixels does not count.
+        """
         kinds = (SegmentOptions, MatchOptions, DecodeOptions)
         return bool(self.changed([name for kind in kinds for name in flat_settings(kind) if name not in COUNTS]))
 
@@ -142,7 +147,7 @@ class CompactOptions(Settings):
     def uncut(self) -> list[str]:
         """Names of the settings in use that are not possible in blocks of views.
 
-        Some of them are possible for views that arrive in batches, see :attr:`compact_only`.
+        Some of these settings are possible for views that arrive in batches, see :attr:`compact_only`.
         """
         values, excluded = self.to_dict(), {"poses": "free", "exposure": "per-photo", "budget": AUTO}
         return [*self.whole_only, *(f"{name} {value}" for name, value in excluded.items() if values[name] == value)]
@@ -153,7 +158,7 @@ class CompactOptions(Settings):
         return [*self.whole_only, *self.blocks.asked]
 
     def changed(self, names: Iterable[str]) -> list[str]:
-        """Return those of the ``names`` whose settings differ from their defaults; they are flat names."""
+        """Return those of the ``names`` whose settings differ from their defaults; all names are flat."""
         values, declared = self.to_dict(), flat_settings(CompactOptions)
         return [name for name in names if values[name] != declared[name].default]
 
@@ -169,7 +174,7 @@ class CompactOptions(Settings):
     def with_settings(self, settings: Mapping[str, Any]) -> CompactOptions:
         """Return options with other ``settings``, by flat name; ValueError for an unknown name.
 
-        If ``recipe`` is among them, its settings are changed first.
+        If ``recipe`` is among the ``settings``, the settings of the recipe are changed first.
         """
         if not isinstance(settings, Mapping):
             raise TypeError(f"settings: expected a dictionary of values by name, got {type(settings).__name__}")

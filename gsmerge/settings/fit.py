@@ -14,14 +14,17 @@ LONG_STEPS = 600  # runs with at least this many steps gain from a little dropou
 USUAL_SHARE = 0.044  # for this many Gaussians per pixel, a quarter of the pixels is enough in the first steps
 GROW_STEPS = 150  # runs with fewer steps do better when they begin with all their Gaussians
 # A run grows only if it has at least this many steps for each photo, because each step draws one photo, and each photo
-# has to be drawn before the growth. With fewer steps, a real scene of 100 views has 20.9 dB without growth, instead of
-# 20.7 dB, and takes .6 of the time
+# has to be drawn before the growth. With fewer steps, a real scene of 100 views has 20.9 dB without growth, and 20.7 dB
+# with growth. Without growth the fit takes .6 of the time that it takes with growth
 GROW_ROUNDS = 2
 
 
 @dataclass(frozen=True)
 class Tuning:
-    """Constants of the fit, which were chosen on training scenes. They are no options: runs change a few themselves."""
+    """Constants of the fit, which were chosen on training scenes.
+
+    Users cannot set these constants, but runs change a few of them.
+    """
 
     means_lr: float = 0.1  # Step size of a mean, in units of the Gaussian's size
     scales_lr: float = 0.2  # Step size of a log scale
@@ -29,7 +32,8 @@ class Tuning:
     opacities_lr: float = 0.3  # Step size of an opacity's logit
     colors_lr: float = 0.03  # Step size of a colour, sRGB in [0, 1]
     poses_lr: float = 0.1  # Step size at the start, in pixels, of the rotation and the shift of a camera that moves
-    # Step sizes of Gaussians at the end, relative to those at the start. Runs of more than 300 steps use less
+    # Step sizes of Gaussians at the end, relative to those at the start. Runs of more than 300 steps use a smaller
+    # factor
     decay: float = 0.4
     beta1: float = 0.8  # Largest decay of Adam's first moment; gsmerge.fit.schedule.first_decay may give less
     beta2: float = 0.9  # Decay of Adam's second moment
@@ -42,33 +46,33 @@ class Tuning:
     # Least scale, in pixels of the photo nearest to the Gaussian. Thinner Gaussians look like needles if a viewer
     # enlarges them. 0 sets no limit
     min_scale: float = 0.5
-    # A Gaussian is long if three standard deviations exceed `long_share` of the width of the nearest photo. Its longest
-    # axis may be at most `max_ratio` times its second one, because longer Gaussians look like strokes from other
-    # viewpoints. This holds after the growth of a run. Before it there are few Gaussians, which fit better if they may
-    # be long
+    # A Gaussian is long if three standard deviations exceed `long_share` of the width of the nearest photo. A
+    # Gaussian's longest axis may be at most `max_ratio` times its second one, because longer Gaussians look like
+    # strokes from other viewpoints. The limit `max_ratio` holds after the growth of a run. Before the growth there are
+    # few Gaussians, which fit better if they may be long
     long_share: float = 0.25
     max_ratio: float = 3.0
     average_share: float = 0.2  # The parameters are averaged over this share of the steps, which are the last ones
     ssim_lambda: float = 0.35  # Share of structural similarity in the loss; the rest is L1
-    # Weight in the loss of the L1 error of differences between neighbouring pixels, at the end of a run. At its start
-    # the weight is 0, because such differences only help once edges are roughly in their places
+    # Weight in the loss of the L1 error of differences between neighbouring pixels, at the end of a run. At the start
+    # of a run the weight is 0, because differences between pixels only help once edges are roughly in their places
     edge_weight: float = 2.4
-    # Weight of the mean opacity in the loss (3DGS-MCMC, Kheradmand et al. 2024). Gaussians that the photos do not need,
-    # and that would hide surfaces in other views, fade by it
+    # Weight of the mean opacity in the loss (3DGS-MCMC, Kheradmand et al. 2024). This weight makes Gaussians fade that
+    # the photos do not need, and that would hide surfaces in other views
     opacity_reg: float = 0.03
-    # Weight of the mean scale in the loss, relative to each Gaussian's size at its start. It lets fewer Gaussians
-    # overlap, so that a step takes a third less time
+    # Weight of the mean scale in the loss, relative to each Gaussian's size at its start. This weight lets fewer
+    # Gaussians overlap, so that a step takes a third less time
     scale_reg: float = 0.01
     outside_every: int = 7  # Every so many steps, a view from outside is drawn, see gsmerge.fit.outside
-    # Share of the steps before the first view from outside; 1 for no such view. Such views remove Gaussians in gaps,
-    # which at first help the others to move
+    # Share of the steps before the first view from outside; 1 for no view from outside. Views from outside remove
+    # Gaussians in gaps, which at first help other Gaussians to move
     outside_from: float = 0.15
     # Scores compensate the exposures of views only if one exposure differs from the mean by this factor. Smaller
     # differences often come from holes and highlights instead of the camera
     min_gain: float = 1.15
 
     def scaled(self, factor: float) -> Tuning:
-        """Return these constants, but with step sizes of Gaussians that are multiplied by ``factor``."""
+        """Return the constants of the fit with step sizes of Gaussians that are multiplied by ``factor``."""
         names = ("means_lr", "scales_lr", "quats_lr", "opacities_lr", "colors_lr")
         return replace(self, **{name: factor * getattr(self, name) for name in names})
 

@@ -22,7 +22,7 @@ KIND_NAMES = {int: "a whole number", float: "a number", bool: "true or false", s
 
 @dataclass(frozen=True)
 class Setting:
-    """The declaration of a setting. :func:`setting` makes it, and :func:`settings_of` adds its name and its type."""
+    """The declaration of a setting, made by :func:`setting`; :func:`settings_of` adds the setting's name and type."""
 
     help: str  # first sentences of the help, which the command line shows too; names of values are in single backticks
     more: str = ""  # further sentences, which only Python's help and docs/reference show
@@ -51,7 +51,7 @@ class Setting:
 
     @property
     def is_list(self) -> bool:
-        """True if the setting takes a list. Choices and range then apply to the elements of the list."""
+        """True if the setting takes a list. Choices and range of a list apply to the elements of the list."""
         return get_origin(self.kind) is tuple
 
     @property

@@ -81,7 +81,10 @@ class SegmentOptions(Settings):
 
     @property
     def share(self) -> float:
-        """Number of superpixels per pixel, if the setting is a share; the default share for a number or "auto"."""
+        """Number of superpixels per pixel, if the setting is a share.
+
+        If the setting is a number or "auto", this is the default share.
+        """
         is_share = self.per_view is None and self.superpixels != AUTO
         return parse_share(str(self.superpixels) if is_share else SHARE)
 
@@ -210,7 +213,10 @@ def parse_crop(text: str) -> tuple[str, tuple[float, ...]]:
 
 @dataclass(frozen=True)
 class Engine(Settings):
-    """Settings that say on which machines scenes or blocks are compacted. The result does not depend on them."""
+    """Settings that say on which machines scenes or blocks are compacted.
+
+    The result does not depend on these settings.
+    """
 
     engine: str = setting("local", "Where scenes or blocks are compacted. local: on this machine; ray: on a Ray "
         "cluster, which needs the package `ray`.", choices=("local", "ray"))  # fmt: skip

@@ -1,6 +1,6 @@
 """Merge pairs greedily, the idea of NanoGS (2026) and of splat-transform's decimation.
 
-Each round builds a graph of nearest neighbours and computes the cost of merging each connected pair. It selects
+Each round builds a graph of nearest neighbours and computes the cost of merging each connected pair. Each round selects
 disjoint pairs by cost, and replaces each pair by the Gaussian with its moments, see :mod:`gsmerge.stages.pair_merge`.
 As in splat-transform, the mass of a Gaussian is its opacity times the area of its ellipsoid. A merged Gaussian has the
 sum of the masses, and an opacity of at most 1 that follows from the sum. The cost is Runnalls' bound on the
@@ -71,7 +71,7 @@ def neighbor_pairs(cloud: Cloud) -> tuple[Ints, Ints, Floats]:
         """List the pairs of the rows from ``start`` on.
 
         If two rows are neighbours of each other, only the lower row lists the pair. A row is also its own neighbour,
-        which is no pair.
+        but makes no pair with itself.
         """
         chunk = nearest[start : start + CHUNK_GAUSSIANS]
         rows = np.repeat(np.arange(start, start + len(chunk)), chunk.shape[1])
@@ -91,9 +91,9 @@ def neighbor_pairs(cloud: Cloud) -> tuple[Ints, Ints, Floats]:
 def cheapest_disjoint(left: Ints, right: Ints, costs: Floats, limit: int) -> Ints:
     """Choose at most ``limit`` disjoint pairs greedily, by ascending cost ``[m]``.
 
-    A pair that is the cheapest pair of both its Gaussians is always chosen. So all such pairs are chosen at once, and
-    the search is repeated among the remaining pairs. If two pairs have equal costs, the earlier pair counts as cheaper.
-    Returns indices of pairs, by ascending cost.
+    A pair that is the cheapest pair of both its Gaussians is always chosen. Therefore all pairs of this kind are chosen
+    at once, and the search is repeated among the remaining pairs. If two pairs have equal costs, the earlier pair
+    counts as cheaper. Returns indices of pairs, by ascending cost.
     """
     order = np.argsort(costs, kind="stable")
     left, right, ranks = left[order], right[order], np.arange(len(order))

@@ -40,7 +40,10 @@ def unmerged_fit(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
 
 
 def prune_faintest(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
-    """Keep the ``count`` most opaque Gaussians, unchanged and in order; of equally opaque ones the first."""
+    """Keep the ``count`` most opaque Gaussians, unchanged and in order.
+
+    Of equally opaque Gaussians the first are kept.
+    """
     gaussians = prepared.scene.file_gaussians
     with stage("reduce"):
         return gaussians[np.sort(np.argsort(-gaussians.opacities, kind="stable")[:count])]
@@ -77,9 +80,9 @@ def match_moments(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
 def splat_transform(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
     """Merge with the program splat-transform of PlayCanvas, which must be installed.
 
-    It runs on the CPU with the option ``-d COUNT`` and its defaults. The input is returned if it has at most ``count``
-    Gaussians. Nothing is downloaded. The measured time includes the start of the program, but not the transfer of
-    Gaussians.
+    The program runs on the CPU with the option ``-d COUNT`` and its defaults. The input is returned if it has at most
+    ``count`` Gaussians. Nothing is downloaded. The measured time includes the start of the program, but not the
+    transfer of Gaussians.
     """
     gaussians = prepared.scene.file_gaussians
     if len(gaussians) <= count:

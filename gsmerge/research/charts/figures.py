@@ -122,7 +122,7 @@ def _describe_scenes(panel: Panel) -> str:
 
 
 def _format_interval(interval: Interval) -> list[str]:
-    """Format a mean and the ends of its interval; the ends are empty if there are too few scenes."""
+    """Format a mean and the ends of its interval; the ends are empty if the scenes are too few."""
     ends = [interval.low, interval.high] if interval.count >= MIN_SCENES else []
     return [f"{value:.5g}" for value in (interval.mean, *ends)] + [""] * (2 - len(ends))
 

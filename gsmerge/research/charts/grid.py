@@ -29,7 +29,7 @@ GridRun = tuple[ChartScene, RunRecord, CompactOptions]  # scene, record without 
 def parse_grid(pairs: Sequence[str]) -> SettingGrid:
     """Make a grid from pairs NAME=A,B with names of settings of compact.
 
-    Raises UsageError if a name is unknown or given twice, or if a pair has no values.
+    Raises UsageError if the name of a setting is unknown or given twice, or if a pair has no values.
     """
     grid: dict[str, list[Any]] = {}
     for pair in pairs:
@@ -42,7 +42,7 @@ def parse_grid(pairs: Sequence[str]) -> SettingGrid:
 
 
 def parse_grid_value(text: str) -> Any:
-    """Parse a number, true or false; return any other text as it is."""
+    """Parse a number, true or false; return any other text unchanged."""
     try:
         return json.loads(text)
     except ValueError:
@@ -52,9 +52,10 @@ def parse_grid_value(text: str) -> Any:
 def list_settings(grid: SettingGrid, fixed: Mapping[str, Any]) -> list[tuple[str, dict[str, Any]]]:
     """List (method, settings) of every run on one scene, the unmerged input first.
 
-    Each run has one budget or one number of superpixels. Every such size is combined with all values of the other
-    settings. ``fixed`` settings hold for all runs. A baseline gets only the settings that it uses. Raises UsageError if
-    a method is unknown, if a setting is invalid, or if a method needs a program that is not installed.
+    Each run has one budget or one number of superpixels. Every budget and every number of superpixels is combined with
+    all values of the other settings. ``fixed`` settings hold for all runs. A baseline gets only the settings that it
+    uses. Raises UsageError if a method is unknown, if a setting is invalid, or if a method needs a program that is not
+    installed.
     """
     sizes = [{name: value} for name in SIZE_SETTINGS for value in grid.get(name, ())] or [{}]
     others = {name: values for name, values in grid.items() if name not in (*SIZE_SETTINGS, "method")}

@@ -78,7 +78,7 @@ class Line:
 def mean_interval(values: Sequence[float]) -> Interval:
     """Compute the mean of at least one value with its two-sided t interval (Student 1908).
 
-    The interval is wide for few values. With two values it reaches 12.7 standard errors to each side.
+    The interval is wide for few values. With two values the interval reaches 12.7 standard errors to each side.
     """
     if not len(values):
         raise ValueError("expected at least one value, got none")
@@ -93,9 +93,9 @@ def mean_interval(values: Sequence[float]) -> Interval:
 def paired_intervals(values: NDArray[np.float64]) -> list[Interval]:
     """Compute a mean and a confidence interval for each column of ``values [scenes,conditions]``.
 
-    Scenes differ by several dB, but conditions by tenths, so plain intervals would hide the effect of conditions. That
-    is why the mean of every scene is subtracted first (Cousineau 2005). A factor corrects the intervals for this (Morey
-    2008).
+    Scenes differ by several dB, but conditions by tenths, so plain intervals would hide the effect of conditions.
+    Therefore the mean of every scene is subtracted first (Cousineau 2005), and a factor corrects the intervals for the
+    subtraction (Morey 2008).
     """
     num_scenes, num_conditions = values.shape
     if num_conditions == 1 or num_scenes == 1:
@@ -146,14 +146,16 @@ class Results:
     Attributes:
         runs: The runs.
         names: Name of each line in figures.
-        part: Views and pixels of the scores, a key of ``PARTS``. It is the first key with scores of nine of ten runs.
+        part: Views and pixels of the scores, a key of ``PARTS``. The chosen key is the first that has scores of nine of
+            ten runs.
         metrics: Names of the scores: PSNR, SSIM, and LPIPS of one network, preferably VGG.
     """
 
     def __init__(self, records: Iterable[RunRecord]) -> None:
         """Choose names, views, pixels and metrics for the successful runs of ``records``."""
         self.runs = [record for record in records if record.error is None]
-        # Runs of gsmerge come first, then baselines. Of each, runs with fewer settings come first
+        # Runs of gsmerge come first, then baselines. Among the runs of gsmerge, and among the baselines, runs with
+        # fewer settings come first
         own_first = sorted(self.runs, key=lambda record: (record.method != OURS, len(line_key(record)[1])))
         keys = dict.fromkeys(map(line_key, own_first))
         self.names = line_names(list(keys))
@@ -211,11 +213,11 @@ def make_lines(records: Sequence[RunRecord], x: str, y: str) -> list[Line]:
 
 
 def keep_common(scenes_of: Mapping[K, set[str]]) -> dict[K, set[str]]:
-    """Choose over which scenes the points of a figure are averaged: if possible, the same scenes for all points.
+    """Choose over which scenes the points of a figure are averaged: if possible, over the same scenes for all points.
 
     ``scenes_of`` are the measured scenes of each point. First, points with less than ``MIN_SHARE`` of all scenes are
     left out, so that failed runs of one setting do not remove scenes of the others. If the remaining points have no
-    scene in common, each keeps its own scenes.
+    scene in common, each point keeps its own scenes.
     """
     fewest = MIN_SHARE * len(set().union(*scenes_of.values()))
     kept = {point: scenes for point, scenes in scenes_of.items() if len(scenes) >= fewest}

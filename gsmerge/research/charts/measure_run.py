@@ -40,9 +40,9 @@ class ChartScene:
 class RunRecord:
     """Record of one run, successful or not.
 
-    ``scores`` are means over views. Their names are made of a metric, "context" for the views that the scene was made
-    of or "target" for held-out views, and "visible" if only pixels that context views see are counted. An example is
-    ``psnr_target_visible``.
+    ``scores`` are means over views. The name of a score is made of a metric, "context" for the views that the scene was
+    made of or "target" for held-out views, and "visible" if only pixels that context views see are counted. An example
+    is ``psnr_target_visible``.
     """
 
     scene: str  # its name
@@ -107,7 +107,7 @@ def run_setting(source: ChartScene, record: RunRecord, options: CompactOptions, 
 
 @lru_cache(maxsize=1)
 def load_source(source: ChartScene) -> tuple[Scene, HeldOutViews | None, tuple[str, ...]]:
-    """Return a scene, its held-out views, and notes; they are cached, since the next run often has the same scene.
+    """Return a scene, its held-out views, and notes; all three are cached, since the next run often has the same scene.
 
     Held-out views are those of ``source.targets``. Without targets, some views are taken out of the scene.
     """

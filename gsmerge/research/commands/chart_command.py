@@ -118,7 +118,7 @@ def _run_all(args: opt.Args, runs: Sequence[GridRun], measured: EvaluateOptions)
 def _draw_results(args: opt.Args, notes: Sequence[str], num_done: int) -> None:
     """Draw the charts, page and table of all runs in the folder, and print a summary.
 
-    ``notes`` go into the report; they are already printed. ``num_done`` is the number of runs of this call.
+    ``notes`` go into the report; these notes are already printed. ``num_done`` is the number of runs of this call.
     """
     from gsmerge.research.charts.chart_page import list_held_out_notes, make_chart_page, make_table
     from gsmerge.research.charts.figures import draw_figures, make_figures

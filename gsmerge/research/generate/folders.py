@@ -67,9 +67,9 @@ def generate(
     """Generate scenes ``out/scene_0000`` and so on, all different; the same arguments give the same bytes.
 
     Every folder gets ``scene.ply``, ``transforms.json``, ``images/``, held-out views in ``targets/``, and
-    ``generated.json`` with the random settings. A folder with the same scene is not changed. So an interrupted call can
-    be repeated, and a call with a larger ``count`` adds scenes. Random numbers depend only on ``seed`` and the scene's
-    number. ``progress`` is called with the number of finished scenes and the number of all scenes.
+    ``generated.json`` with the random settings. A folder with the same scene is not changed, so that an interrupted
+    call can be repeated, and a call with a larger ``count`` adds scenes. Random numbers depend only on ``seed`` and the
+    scene's number. ``progress`` is called with the number of finished scenes and the number of all scenes.
 
     Raises:
         ValueError: If ``count`` or ``seed`` is out of range.
@@ -101,13 +101,16 @@ RECORD = "generated.json"
 
 
 def scene_facts(seed: int, index: int, options: GenerateOptions) -> dict[str, Any]:
-    """Return all that defines a scene, as JSON types. A record of a scene begins with these facts."""
+    """Return all that defines a scene, as JSON types. The record of a scene begins with this description."""
     record_version = 3  # increases if the same seed and options give other scenes than before
     return {"record_version": record_version, "seed": seed, "index": index, "options": options.to_dict()}
 
 
 def is_complete(folder: Path, facts: Mapping[str, Any]) -> bool:
-    """Return True if a folder has the complete scene with these facts. Raises UsageError if it has other contents."""
+    """Return True if a folder has the complete scene with these facts.
+
+    Raises UsageError if the folder has other contents.
+    """
     try:
         record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
     except (OSError, ValueError):

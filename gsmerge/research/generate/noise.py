@@ -28,8 +28,8 @@ LOG_UNIFORM = ("view_bias", "drift", "grain", "turn", "shift", "unit")  # values
 class NoiseOptions:
     """Ranges from which the values of each scene are drawn: errors of a network, and habits of its exporter.
 
-    Depth errors are standard deviations of the logarithm of depth. They are about equal to relative errors of depth.
-    docs/internals/lab.md compares the ranges with real exports.
+    Depth errors are standard deviations of the logarithm of depth. These standard deviations are about equal to
+    relative errors of depth. docs/internals/lab.md compares the ranges with real exports.
     """
 
     view_bias: Range = (0.0002, 0.02)  # scale error of a view
@@ -42,6 +42,7 @@ class NoiseOptions:
     bleed_width: Range = (0.6, 1.8)  # standard deviation of the smoothing of inverse depth, pixels
     far: Range = (4.0, 12.0)  # largest depth that the network predicts, in medians of the depth
     # Share of the pixels whose Gaussian floats in front of the surface. At depth edges the share is 11 times as large
+    # as elsewhere
     floaters: Range = (0.0, 0.004)
     turn: Range = (0.005, 0.3)  # rotation error of a pose, degrees
     shift: Range = (0.0001, 0.004)  # translation error of a pose, in median depths
@@ -77,7 +78,7 @@ else:  # the values that were drawn for one scene, under the names of their rang
 def draw_noise(options: NoiseOptions, rng: np.random.Generator, factor: float = 1.0) -> Noise:
     """Draw the values of one scene from their ranges.
 
-    ``factor`` multiplies the values of ``ERRORS``. Of these, shares and ``bleed`` are then cut to 1.
+    ``factor`` multiplies the values of ``ERRORS``. Shares of pixels and ``bleed`` are then cut to 1.
     """
     drawn: dict[str, float] = {}
     for name in NOISE_RANGES:
@@ -136,9 +137,9 @@ def texture_mask(image: Float) -> Float:
 def predict_depth(view: TrueView, noise: Noise, rng: np.random.Generator) -> tuple[Float, Float]:
     """Simulate a network's depth ``[h,w]`` and its confidence ``[h,w]`` in [0, 1].
 
-    Errors of the logarithm of depth are a bias of the view, a slow drift, wrong patches and fine grain. All of them are
-    larger in areas without texture. Besides, edges are smoothed in inverse depth, depth is cut at a largest value, and
-    some pixels float in front of their surface.
+    Errors of the logarithm of depth are a bias of the view, a slow drift, wrong patches and fine grain. All these
+    errors are larger in areas without texture. Besides, edges are smoothed in inverse depth, depth is cut at a largest
+    value, and some pixels float in front of their surface.
     """
     height, width = view.depth.shape
     far = noise.far * float(np.median(view.depth))
@@ -162,7 +163,7 @@ def predict_depth(view: TrueView, noise: Noise, rng: np.random.Generator) -> tup
 
 
 def _wrong_patches(blank: Float, noise: Noise, rng: np.random.Generator) -> Float:
-    """Draw a mask ``[h,w]`` of patches of wrong depth, 0 to 1; they are more likely where the photo is ``blank``."""
+    """Draw a mask ``[h,w]`` of patches of wrong depth, 0 to 1; patches are more likely where the photo is ``blank``."""
     height, width = blank.shape
     field = smooth_noise(rng, height, width, int(rng.integers(5, 12))) + noise.blank * blank
     limit = np.float32(np.quantile(field.astype(np.float64), 1 - noise.patches))

@@ -1,7 +1,7 @@
 """Render photos and exact depth of a room.
 
-A ray of each sample finds the first surface. Its colour comes from the surface's texture, and from lights with shadow
-maps. A tone curve like that of film turns the light into the colours of a photo.
+A ray of each sample finds the first surface. The sample's colour comes from the surface's texture, and from lights with
+shadow maps. A tone curve like that of film turns the light into the colours of a photo.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ class LitRoom:
 
 
 def screen_boxes(shapes: ShapeArrays, c2w: Array, lens: Pinhole, samples: int) -> NDArray[np.int32]:
-    """Compute in which samples of a picture each shape can appear: a box ``[m,4]`` of x0, y0, x1 and y1."""
+    """Compute boxes ``[m,4]`` of x0, y0, x1, y1: the samples in which the camera ``c2w`` may see each shape."""
     points, valid = _clipped_corners(shapes, c2w)
     pixels = points[..., :2] / np.where(valid, points[..., 2:], 1) * lens.focal + [lens.width / 2, lens.height / 2]
     limits = np.array([lens.width, lens.height]) * samples
@@ -102,7 +102,7 @@ def screen_boxes(shapes: ShapeArrays, c2w: Array, lens: Pinhole, samples: int) -
 
 
 def _clipped_corners(shapes: ShapeArrays, c2w: Array) -> tuple[Array, Array]:
-    """Clip the bounding boxes of shapes at the near plane.
+    """Clip the bounding boxes of shapes at the near plane of the camera ``c2w [4,4]``.
 
     Returns points ``[m,20,3]`` in the camera's frame: the 8 corners, then the points where the 12 edges cross the near
     plane. A mask ``[m,20,1]`` is True for corners beyond the plane, and for edges that cross it.
@@ -123,7 +123,7 @@ def _clipped_corners(shapes: ShapeArrays, c2w: Array) -> tuple[Array, Array]:
 
 
 def trace(shapes: ShapeArrays, c2w: Array, lens: Pinhole, samples: int) -> Hits:
-    """Cast ``samples`` x ``samples`` rays for each pixel, and return their first hits."""
+    """Cast ``samples`` x ``samples`` rays for each pixel of the camera ``c2w [4,4]``, and return their first hits."""
     h, w = lens.height * samples, lens.width * samples
     hits = Hits(np.full((h, w), NO_SURFACE_DEPTH), np.full((h, w), -1, np.int32), *np.zeros((2, h, w, 3), np.float32))
     intrinsics = np.array([lens.focal, lens.focal, lens.width / 2, lens.height / 2])
@@ -145,7 +145,10 @@ def _shadow_map_axes(towards: Array) -> Array:
 
 
 def _shadow_map(shapes: ShapeArrays, axes: Array, middle: Array, radius: float, size: int) -> Float:
-    """Compute a shadow map ``[size,size]``: by how much the first surface is deeper than ``middle``."""
+    """Compute the shadow map ``[size,size]`` along ``axes [3,3]``, of all within ``radius`` of ``middle``.
+
+    A pixel says by how much the first surface is deeper than ``middle``.
+    """
     c2w = np.eye(4)
     behind = 1000.0  # distance of a shadow map's camera in radii, so that its rays are nearly parallel
     c2w[:3, :3], c2w[:3, 3] = axes.T, middle - behind * radius * axes[2]
@@ -215,7 +218,7 @@ def texture_coordinates(shapes: ShapeArrays, ids: NDArray[np.int32], points: Flo
 def look_up_colors(lit: LitRoom, ids: NDArray[np.int32], points: Float, spread: Float) -> Float:
     """Look up the texture colours ``[n,3]``, sRGB, of points in the frames of the shapes ``ids [n]``.
 
-    ``spread [n]`` is the size of a sample at the point, in world units. It chooses the mipmap.
+    ``spread [n]`` is the size of a sample at the point, in world units. This size chooses the mipmap.
     """
     uv, repeat = texture_coordinates(lit.shapes, ids, points)
     textures = np.array([s.material.texture for s in lit.shapes.shapes])[ids]
@@ -273,7 +276,7 @@ def _reflect(lit: LitRoom, hits: Hits, rows: NDArray[np.int64], c2w: Array, lens
 
 
 def _incoming_light(lit: LitRoom, positions: Float, normals: Float) -> tuple[Float, Float]:
-    """Compute the direct and the ambient light ``[n]`` that arrives at points, with shadows."""
+    """Compute the direct and the ambient light ``[n]`` that arrives at ``positions [n,3]``, with shadows."""
     light, half_side = lit.room.light, lit.radius
     direct, indirect = np.zeros((2, len(positions)), np.float32)
     key_texels, ambient_texels = 2.0, 1.2  # texels by which a lit surface may lie behind the shadow map's depth

@@ -83,7 +83,7 @@ def box(low: Vector, high: Vector, material: Material) -> Shape:
 
 
 def quad(centre: Vector, half: Pair, material: Material, rotation: Array = FACING_FRONT) -> Shape:
-    """Make a rectangle with the half sides ``half``. Without a rotation it faces -z."""
+    """Make a rectangle with the half sides ``half``. Without a rotation the rectangle faces -z."""
     return Shape(QUAD, (*half, 0.0, 1.0), material, np.asarray(centre, float), rotation)
 
 
@@ -93,7 +93,7 @@ def ball(centre: Vector, radii: Vector, material: Material) -> Shape:
 
 
 def column(foot: Vector, height: float, radius: float, material: Material, *, top: float = 1.0) -> Shape:
-    """Make an upright cylinder or cone on the point ``foot``. Its top radius is ``top`` times ``radius``."""
+    """Make an upright cylinder or cone on the point ``foot``. The radius at the top is ``top`` times ``radius``."""
     x, y, z = foot
     size = (radius * top, height / 2, radius * top, 1 / top)  # the kernel takes the radii of the top, which is at -y
     return Shape(CONE, size, material, np.array([x, y - height / 2, z]))
@@ -110,7 +110,7 @@ def rod(start: Vector, end: Vector, radius: float, material: Material) -> Shape:
 
 
 def leaf(centre: Vector, half: Pair, material: Material, rotation: Array) -> Shape:
-    """Make a pointed leaf with the half sides ``half``. Before the rotation its tips are on the y axis."""
+    """Make a pointed leaf with the half sides ``half``. Before the rotation the tips of the leaf are on the y axis."""
     return Shape(LEAF, (*half, 0.0, 1.0), material, np.asarray(centre, float), rotation)
 
 

@@ -134,18 +134,19 @@ class _PhotoSession:
     gain: float  # exposure of the photos
 
     def exported_pose(self, place: int) -> Array:
-        """Return a camera-to-world matrix in the world and the units of the exporter."""
+        """Return the camera-to-world matrix of a place on the path, in the world and the units of the exporter."""
         pose = matmul(self.to_export, self.poses[place])
         pose[:3, 3] *= self.noise.unit
         return pose
 
     def take_photo(self, place: int, seed: int) -> Float:
-        """Take the photo ``[h,w,3]`` of one pose."""
+        """Take the photo ``[h,w,3]`` of a place on the path."""
         return _take_photo(self.lit, self.poses[place], self.photo_lens, self.noise, self.gain, seed)
 
     def predict(self, place: int, photo: Float, deviation: Array, seed: int) -> tuple[Array, Gaussians]:
-        """Simulate the network for one photo; return the pose and the Gaussians that it estimates.
+        """Simulate the network for the photo of a place on the path.
 
+        Return the pose and the Gaussians that it estimates.
         ``deviation [2,3]`` is the random error of the pose, see :func:`_perturb_pose`.
         """
         hits = trace(self.lit.shapes, self.poses[place], self.lens, 1)
@@ -206,7 +207,7 @@ def _plan_session(rng: np.random.Generator, options: GenerateOptions) -> _PhotoS
 
 
 def _shrink_lens(lens: Pinhole) -> Pinhole:
-    """Return a smaller camera for previews. They show if views are usable, and how bright they are."""
+    """Return a smaller camera for previews, which show if views are usable, and how bright views are."""
     divisor = 8  # the sides of previews are those of views divided by this
     return Pinhole(max(8, lens.width // divisor), max(8, lens.height // divisor), lens.focal / divisor)
 
@@ -227,7 +228,7 @@ def _find_room(rng: np.random.Generator, lens: Pinhole, num_views: int) -> tuple
 
 
 def _take_photo(lit: LitRoom, pose: Array, lens: Pinhole, noise: Noise, gain: float, seed: int) -> Float:
-    """Render a photo ``[h,w,3]`` with the errors of lens, sensor and exposure."""
+    """Render the photo ``[h,w,3]`` of a pose, with the errors of lens and sensor, and with the exposure ``gain``."""
     rng = np.random.default_rng(seed)
     linear = render_light(lit, pose, lens, SAMPLE_RAYS)
     gains = gain * exp(noise.exposure * rng.normal() + noise.tint * rng.normal(0, 1, 3))
@@ -244,8 +245,8 @@ def _take_photo(lit: LitRoom, pose: Array, lens: Pinhole, noise: Noise, gain: fl
 def _perturb_pose(pose: Array, noise: Noise, depth: float, deviation: Array) -> Array:
     """Add the network's error to a pose, for a median ``depth``.
 
-    ``deviation [2,3]`` has standard normal numbers for rotation and position. They are multiplied by the sizes of the
-    errors, ``noise.turn`` and ``noise.shift``.
+    ``deviation [2,3]`` has standard normal numbers for rotation and position. These numbers are multiplied by the sizes
+    of the errors, ``noise.turn`` and ``noise.shift``.
     """
     rotation = np.deg2rad(noise.turn) * deviation[0] / 3**0.5
     angle = np.sqrt((rotation * rotation).sum())

@@ -30,8 +30,9 @@ def enlarge_texture(cells: NDArray[np.float64], size: int) -> Grey:
 def draw_octaves(
     rng: np.random.Generator, size: int, *, first: int = 4, fade: float = 0.6, stretch: int = 1, ridged: bool = False
 ) -> Grey:
-    """Draw noise as a sum of octaves. Each octave has half the cell size and ``fade`` times the strength of the last.
+    """Draw noise as a sum of octaves.
 
+    Each octave has half the cell size and ``fade`` times the strength of the octave before.
     A ``fade`` of 0.3 gives clouds, and one of 0.9 gives grit. ``first`` is the number of cells of the coarsest octave
     along a side. ``stretch`` is the ratio of a cell's length to its height. Noise that is ``ridged`` has sharp crests,
     as in rock and bark.
@@ -46,7 +47,7 @@ def draw_octaves(
 
 
 def pixel_places(size: int) -> tuple[Grey, Grey]:
-    """Return x and y of the centres of all pixels, as shares of the picture's side."""
+    """Return x and y ``[size,size]`` of the centres of all pixels, as shares of the picture's side."""
     centres = (np.arange(size, dtype=np.float32) + 0.5) / size
     x, y = np.meshgrid(centres, centres)
     return x, y
@@ -409,8 +410,8 @@ class Palette:
     def material(self, *kinds: str, repeat: float = 0.0, gloss: float | None = None) -> Material:
         """Make a material of a random one of ``kinds``, with a new texture until the kind has its number of textures.
 
-        ``repeat`` is the number of repeats per world unit. If it is 0, the texture covers every face once. ``gloss`` is
-        random by default, and zero in about half of the cases.
+        ``repeat`` is the number of repeats per world unit. If ``repeat`` is 0, the texture covers every face once.
+        ``gloss`` is random by default, and zero in about half of the cases.
         """
         kind = kinds[self.rng.integers(len(kinds))]
         other_textures = 3  # most textures of any other kind

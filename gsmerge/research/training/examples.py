@@ -104,7 +104,7 @@ def example_name(path: Path) -> str:
 
 
 def make_example(training: TrainingScene, options: TrainOptions, density: float, name: str) -> Example:
-    """Segment and encode a scene without networks, and return the example; ``density`` is in superpixels per pixel."""
+    """Segment and encode a scene without networks, by ``density`` superpixels per pixel, into the example ``name``."""
     changes = {"superpixels": share_text(density), "segmentation": options.segmentation, "seed": options.seed}
     settings, scene, members = CompactOptions().with_settings(changes), training.scene, training.members
     features = encode(scene, members, segment(scene_pictures(scene), settings.segment))
@@ -149,7 +149,7 @@ def select_example_views(example: Example, ids: Sequence[int]) -> Example:
 def draw_random_views(example: Example, options: TrainOptions, rng: np.random.Generator) -> Example:
     """Restrict an example to random views, as many as ``options.random_views`` allows (paper supplement C).
 
-    Without this option the example keeps its views.
+    If ``options.random_views`` is not set, the example keeps its views.
     """
     if not options.random_views:
         return example

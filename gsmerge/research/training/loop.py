@@ -2,8 +2,8 @@
 
 Validation uses the same windows of its examples every time. The examples are read one after another.
 
-Random numbers depend only on seed and step, and the gradients of crops are added in order. So a resumed run ends with
-the same bytes as an uninterrupted run, on any number of threads.
+Random numbers depend only on seed and step, and the gradients of crops are added in order, so that a resumed run ends
+with the same bytes as an uninterrupted run, on any number of threads.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ def train(
         validation: Examples by which the best checkpoint is chosen; empty: other windows of ``shards``.
         out: Folder for ``best.safetensors``, ``last.safetensors``, ``losses.csv`` and ``state.safetensors``.
         options: Settings.
-        threads: Number of threads; None: all processors. The result does not depend on it.
+        threads: Number of threads; None: all processors. The result does not depend on the number of threads.
         progress: Called with (step, steps, loss) after every step.
 
     Raises:

@@ -18,7 +18,7 @@ LOSS_WINDOW = WINDOW_SIDE  # pixels per side of the windows of loss_ssim
 
 
 def loss_ssim(image: Tensor, photo: Tensor) -> Tensor:
-    """Compute the structural similarity ``[h,w,3]`` around every pixel; torch can differentiate it.
+    """Compute the structural similarity ``[h,w,3]`` of image and photo around every pixel, differentiable by torch.
 
     Windows are uniform, and have ``LOSS_WINDOW`` pixels per side. Pixels beyond the border are zero. Covariances are
     sums divided by the number of pixels. The constants of SSIM are K1 = .01 and K2 = .03.

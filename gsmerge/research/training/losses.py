@@ -3,8 +3,8 @@
 All Feature Gaussians that reach into a window of a photo run through all networks, and the window is rendered from them
 (paper section 4.6). Pixels that the scene does not cover have no loss, so networks need not guess them. LPIPS has the
 values of :mod:`gsmerge.measure.lpips`, and torch can differentiate it. Two regularizers act in early training. One
-penalises Gaussians that are far from the moments of their groups, which are the paper's teacher. The other penalises
-children of one group that lie upon each other.
+regularizer penalises Gaussians that are far from the moments of their groups, which are the paper's teacher. The other
+regularizer penalises children of one group that lie upon each other.
 """
 
 from __future__ import annotations
@@ -110,7 +110,10 @@ def color_loss(image: Tensor, photo: Tensor, mask: Tensor, kind: str) -> Tensor:
 
 
 def masked_ssim(image: Tensor, photo: Tensor, mask: Tensor) -> Tensor:
-    """Average :func:`loss_ssim` of images ``[h,w,3]`` over the pixels of ``mask [h,w]``. An empty mask gives 1."""
+    """Average :func:`loss_ssim` of image and photo ``[h,w,3]`` over the pixels of ``mask [h,w]``.
+
+    An empty mask gives 1.
+    """
     if not bool(mask.any()):
         return torch.ones(())
     return (loss_ssim(image, photo).mean(-1) * mask).sum() / mask.sum()
@@ -151,11 +154,11 @@ def window_psnr(window: Window, image: Tensor) -> float:
 def teacher_loss(prediction: Prediction, members: Members) -> Tensor:
     """Compute the distance of Gaussians from the moments of their groups (paper section 4.6).
 
-    The teacher of a group is one Gaussian with the opacity-weighted mean and covariance of its members' means (eq.
-    teacher_mean, teacher_cov), their mean colour, and the opacity that conserves their optical depth. The loss is the
-    angle between the rotations plus L1 distances of means, logarithms of scales, opacities and base colours. The unit
-    of the distance of means is the teacher's size. A Gaussian has 24 equivalent pairs of rotation and scales, of which
-    the pair nearest to the prediction is used.
+    The teacher of a group is one Gaussian with the opacity-weighted mean and covariance of its members' means
+    (equations teacher_mean and teacher_cov), the members' mean colour, and the opacity that conserves the members'
+    optical depth. The loss is the angle between the rotations plus L1 distances of means, logarithms of scales,
+    opacities and base colours. The unit of the distance of means is the teacher's size. A Gaussian has 24 equivalent
+    pairs of rotation and scales, of which the pair nearest to the prediction is used.
     """
     g, merged = prediction.gaussians, prediction.merged
     if len(g) == 0:
@@ -230,8 +233,9 @@ def sibling_pairs(parents: Tensor) -> tuple[Tensor, Tensor]:
 def overlap_profile(gaussians: Gaussians, left: Tensor, right: Tensor) -> Tensor:
     """Compute the paper's penalty ``[p]`` of pairs that overlap too much or too little.
 
-    It is 0 for pairs whose boxes have an intersection over union of a half. A box is parallel to the world's axes, and
-    reaches one standard deviation to each side, as in matching.
+    The pairs are rows ``left [p]`` and ``right [p]``. The penalty is 0 for pairs whose boxes have an intersection over
+    union of a half. A box is parallel to the world's axes, and reaches one standard deviation to each side, as in
+    matching.
     """
     axes = quat_to_rotmat(gaussians.quats) * gaussians.scales[:, None]
     halves = axes.norm(dim=2)

@@ -1,10 +1,10 @@
 """Encoder, decoder heads, merger and refiner as torch modules, for training (paper sections 4.2 to 4.5).
 
-All of them take tokens, and return raw corrections of what the closed formulas of the stages compute (fig.
+All networks take tokens, and return raw corrections of what the closed formulas of the stages compute (fig.
 architecture). The last layers start at zero, so untrained networks change nothing.
 
-They are built from the blocks of the Set Transformer (Lee et al. 2019). Sets are padded to one size. ``mask`` is True
-for tokens of the set and False for padding, which gets no attention.
+All networks are built from the blocks of the Set Transformer (Lee et al. 2019). Sets are padded to one size. ``mask``
+is True for tokens of the set and False for padding, which gets no attention.
 """
 
 from __future__ import annotations
@@ -45,7 +45,11 @@ def zero_init(layer: nn.Linear) -> nn.Linear:
 
 
 def small_init(layer: nn.Linear) -> nn.Linear:
-    """Make a layer's initial weights small. With zeros, the children of a group would be equal and stay equal."""
+    """Make a layer's initial weights small.
+
+    With weights of 0, the children of a group would be equal, would get equal gradients, and would therefore stay
+    equal.
+    """
     with torch.no_grad():
         for values in layer.parameters():
             values.mul_(0.1)
@@ -62,7 +66,7 @@ class Attention(nn.Module):
         self.query, self.pair, self.out = nn.Linear(width, width), nn.Linear(width, 2 * width), nn.Linear(width, width)
 
     def forward(self, x: Tensor, context: Tensor, mask: Tensor) -> Tensor:
-        """Return the attended values ``[b,q,w]``."""
+        """Return the attended values ``[b,q,w]``; the class names the shapes."""
         key, value = self.pair(context).chunk(2, -1)
         split = [t.unflatten(-1, (self.heads, -1)).transpose(1, 2) for t in (self.query(x), key, value)]
         mixed = scaled_dot_product_attention(split[0], split[1], split[2], attn_mask=mask[:, None, None])
@@ -83,7 +87,7 @@ class AttentionBlock(nn.Module):
         self.attention, self.mlp = Attention(width, heads), mlp(width, 2 * width, width)
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """Return the tokens ``[b,n,w]`` after attending to each other."""
+        """Return the tokens ``x [b,n,w]`` after attending to each other; ``mask [b,n]``."""
         context = self.before(x)
         if self.first_only:
             x = x[:, :1]
@@ -102,7 +106,7 @@ class Pooling(nn.Module):
         self.attention, self.mlp = Attention(width, heads), mlp(width, 2 * width, width)
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """Return one token for each set, ``[b,w]``."""
+        """Return one token ``[b,w]`` for each set ``x [b,n,w]`` with ``mask [b,n]``."""
         query = self.seed.expand(len(x), -1, -1)
         pooled = query + self.attention(query, self.before(x), mask)
         return (pooled + self.mlp(self.between(pooled)))[:, 0]
@@ -140,7 +144,7 @@ class Encoder(nn.Module):
         self.latent, self.shift = nn.Linear(options.width, options.latent), zero_init(nn.Linear(options.width, 3))
 
     def forward(self, tokens: Tensor, mask: Tensor, group: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the raw latent ``[b,latent]`` and the raw shift ``[b,3]``."""
+        """Return the raw latent ``[b,latent]`` and the raw shift ``[b,3]``; arguments as in :class:`SetNetwork`."""
         hidden = nn.functional.gelu(self.set(tokens, mask, group))
         return self.latent(hidden), self.shift(hidden)
 

@@ -4,7 +4,7 @@ The geometry of the stages is computed on tensors here, so that gradients pass f
 results of earlier stages. The formulas are those of the kernels that the stages use (:mod:`gsmerge.networks.tokens`,
 :mod:`gsmerge.geometry.pooling`, :mod:`gsmerge.networks.corrections`). Choices have no gradient: members, neighbours,
 clusters, order of axes, views, and the agreement of a group with other views. A value that is "zero, with a gradient"
-is added to results of kernels: it does not change them, and gives them a gradient.
+is added to results of kernels: this addition gives the results a gradient, and does not change their values.
 """
 
 from __future__ import annotations
@@ -244,7 +244,8 @@ def pool_tensors(features: FeatureGaussians, order: np.ndarray, cuts: np.ndarray
 def make_round_tensors(parents: np.ndarray, group_features: GroupFeatures, children: Gaussians) -> Gaussians:
     """Convert round Gaussians from :func:`gsmerge.networks.apply.prepare_children` to tensors with a gradient.
 
-    Heads whose outputs are "absolute" make children by correcting such Gaussians. ``parents [n]`` are their groups.
+    Heads whose outputs are "absolute" make children by correcting round Gaussians. ``parents [n]`` are the groups of
+    the round Gaussians.
     """
     parent_ids, base, tensors = torch.from_numpy(parents), group_features.base, children.to("cpu")
     frames = group_features.frames[parent_ids]
@@ -273,7 +274,11 @@ class TrainingContext(NetworkContext):
     def make_tokens(
         self, parts: Gaussians | Members, ids: np.ndarray, owners: np.ndarray, group_features: GroupFeatures
     ) -> Array:
-        """Make tokens: tensors for Gaussians, and arrays for members, since no network changes members."""
+        """Make tokens.
+
+        Tokens are tensors for Gaussians, and arrays for members, since no network changes members. The arguments are
+        those of :func:`gsmerge.networks.tokens.part_tokens`.
+        """
         if isinstance(parts, Gaussians):
             return differentiate_tokens(parts, ids, owners, group_features)
         return super().make_tokens(parts, ids, owners, groups_to_arrays(group_features))
@@ -313,7 +318,7 @@ class Prediction:
 
 @dataclass(frozen=True, eq=False)
 class RefinedCrop:
-    """The merged and refined Feature Gaussians of a crop. They do not depend on K."""
+    """The merged and refined Feature Gaussians of a crop, which do not depend on K."""
 
     context: TrainingContext
     described: GroupFeatures  # these Feature Gaussians as inputs of the heads, tensors with a gradient
@@ -334,8 +339,8 @@ def refine_crop(crop: Crop, networks: Networks, options: TrainOptions, seed: int
 def decode_crop(refined: RefinedCrop, crop: Crop, k: int) -> Prediction:
     """Decode every Feature Gaussian of a crop into ``k`` children, and correct them by the heads, with gradients.
 
-    If ``k`` is more than 1, the closed formulas make the children from the members, without a gradient. Then earlier
-    stages get gradients only through the inputs of the heads. Heads with "absolute" outputs make the children
+    If ``k`` is more than 1, the closed formulas make the children from the members, without a gradient. In this case
+    earlier stages get gradients only through the inputs of the heads. Heads with "absolute" outputs make the children
     themselves.
     """
     described, context = refined.described, refined.context
@@ -364,8 +369,9 @@ def _merge(encoded: FeatureGaussians, matches: Matches, context: TrainingContext
 def _make_children(
     crop: Crop, arrays: FeatureGaussians, described: GroupFeatures, context: TrainingContext, k: int
 ) -> tuple[Gaussians | None, np.ndarray]:
-    """Make ``k`` children of every Feature Gaussian, by closed formulas; return them, and their parents ``[n]``.
+    """Make ``k`` children of every Feature Gaussian, by closed formulas.
 
+    Return the children, and their parents ``[n]``.
     Parents are rows of Feature Gaussians, ascending. The children are None if the heads make them themselves.
     """
     if context.makes_children:

@@ -63,9 +63,9 @@ def make_training_scene(scene: Scene, ids: Sequence[int], held_out: Views | None
 def measure_covered(training: TrainingScene, level: float = 1) -> np.ndarray:
     """Measure how far each chosen view covers every pixel of each photo, ``[v,p,h,w]`` uint8.
 
-    A pixel has the opacity of the view's Gaussians, times 255. It has 0 if the view does not see what the pixel shows.
-    :func:`covered_pixels` finds from these values what a subset of the views covers. ``level`` divides the photos'
-    sides.
+    The value of a pixel is the opacity of the view's Gaussians, times 255. The value is 0 if the view does not see what
+    the pixel shows. :func:`covered_pixels` finds from these values what a subset of the views covers. ``level`` divides
+    the photos' sides.
     """
     scene, photos = training.scene, training.photos(level)
     cameras = Cameras(photos.viewmats, photos.Ks, photos.width, photos.height)

@@ -1,8 +1,8 @@
 """Store examples in files, so that few of them are in memory at a time.
 
 A shard is a safetensors file with one example. The shards of a scene are listed in a record, a JSON file that is
-written after all of them. The record's name is a hash of the scene's files and of the settings. So an interrupted call
-continues with the first scene that has no record.
+written after all shards. The record's name is a hash of the scene's files and of the settings, so that an interrupted
+call continues with the first scene that has no record.
 """
 
 from __future__ import annotations

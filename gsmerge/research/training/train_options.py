@@ -168,9 +168,9 @@ PAPER: Mapping[str, Any] = {
     "diversity_weight": 1.0,
     "diversity_steps": 50_000,
 }
-# Settings of the shipped networks. They have no encoder and no merger, which did not raise the PSNR of validation. They
-# have no corrections of colour, which learnt the exposure of the training photos. docs/internals/networks.md has the
-# figures.
+# Settings of the shipped networks. These networks have no encoder and no merger, because neither raised the PSNR of
+# validation. These networks do not correct colours, because corrections of colour learnt the exposure of the training
+# photos. docs/internals/networks.md has the figures.
 SHIPPED_TRAINING: Mapping[str, Any] = {
     "encoder": False,
     "merger": False,

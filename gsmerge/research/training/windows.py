@@ -80,8 +80,9 @@ def sample_window(
 ) -> Window:
     """Sample a window around a random pixel that the example's views cover.
 
-    K is drawn from ``levels``. The window has ``side`` pixels per side, or less in smaller photos. It is halved while
-    more than ``most`` Feature Gaussians reach into it. ``novel`` is the probability that novel views are tried first.
+    K is drawn from ``levels``. The window has ``side`` pixels per side, or less in smaller photos. The side is halved
+    while more than ``most`` Feature Gaussians reach into the window. ``novel`` is the probability that novel views are
+    tried first.
     """
     k = levels[int(rng.integers(len(levels)))]
     photo, pixels = _choose_photo(example, novel, rng)
@@ -99,8 +100,9 @@ def sample_window(
 
 
 def _choose_photo(example: Example, novel: float, rng: np.random.Generator) -> tuple[int, np.ndarray]:
-    """Choose a random photo with pixels that the example's views cover; return its number, and these pixels' indices.
+    """Choose a random photo with pixels that the example's views cover.
 
+    Return the number of the photo, and these pixels' indices.
     ``novel`` is the probability that novel views are tried first. If the views cover no pixel of any photo, the last
     tried photo is returned, and no indices.
     """
@@ -116,7 +118,7 @@ def _choose_photo(example: Example, novel: float, rng: np.random.Generator) -> t
 
 
 def _reaching_rows(example: Example, photo: int, box: Box) -> np.ndarray:
-    """Return the rows of the Feature Gaussians that reach into a box of a photo, or that corrections may move there."""
+    """Return the rows of the Feature Gaussians that reach into a box of a photo, or may after corrections."""
     border = 4  # width, in pixels, of the frame around the box from which corrections may move Gaussians into it
     wide = Box(box.left - border, box.top - border, box.width + 2 * border, box.height + 2 * border)
     tiled = tile_view(
