@@ -216,17 +216,17 @@ def head(run: Run) -> str:
             f"This page says what each step of `gsmerge.compact(folder)` makes of a scene of {count:,} Gaussians.",
             "The [generator](lab.md) makes the scene:",
             f"{VIEWS} photos of {WIDTH} x {HEIGHT} pixels of a room, their cameras, and a `scene.ply` with one",
-            "Gaussian per pixel, which has the errors of a predicted depth.",
+            "Gaussian per pixel, with the errors of a predicted depth.",
             "[Conventions](../reference/conventions.md) explain names and words.",
         ),
         text(
-            "Lists give arrays with shape and type, and the values of one row.",
-            f"The row belongs to pixel ({X}, {Y}) of view {VIEW}, or to what became of this pixel.",
+            "Lists give arrays with shape and type, and the values of one row of each array.",
+            f"This row belongs to pixel ({X}, {Y}) of view {VIEW}, or to what became of this pixel.",
         ),
         f"![One view: photo, superpixels, Feature Gaussians, merged, fitted, result](../images/{PICTURE.name})",
         text(
-            f"All panels show view {VIEW}. Ellipses are contours at one standard deviation: yellow for pixels of this",
-            "view alone, blue for several views, pink for what became of the pixel.",
+            f"All panels show view {VIEW}. Ellipses are contours of Gaussians at one standard deviation: yellow for",
+            "Gaussians of this view alone, blue for several views, pink for what became of the pixel.",
         ),
     ])  # fmt: skip
 
@@ -289,8 +289,8 @@ def prepare_section(run: Run) -> str:
             entry("moved", prepared.moved),
         ]),
         text(
-            "The frame has its origin at the median of the means. Its unit is the power of two nearest to the median",
-            "depth, so thresholds mean the same in every scene.",
+            "The frame has its origin at the median of the means. The frame's unit is the power of two nearest to the",
+            "median depth, so thresholds mean the same in every scene.",
             say(
                 "The photos show what the Gaussians show, so the fit and all scores refer to them.",
                 prepared.reference.name == "photos" and prepared.reference.score_views == tuple(range(VIEWS)),
@@ -309,8 +309,8 @@ def plan_section(run: Run) -> str:
     return "\n\n".join([
         "## 3. make_plan: every decision",
         text(
-            "[`plan.py`](../../gsmerge/plan.py) turns options and facts into a `Plan`. Later steps never see",
-            "`CompactOptions`.",
+            "[`plan.py`](../../gsmerge/plan.py) turns options and facts into a `Plan`, which the steps below get in",
+            "place of `CompactOptions`.",
         ),
         "\n".join([
             entry("limits.per_view", limits.per_view),
@@ -323,14 +323,15 @@ def plan_section(run: Run) -> str:
         ]),
         text(
             say(
-                "No option limits the number of Gaussians, and each view has its own, so"
+                "No option limits the number of Gaussians, and each view has Gaussians of its own, so"
                 f" {plan.settings['superpixels']} of the",
                 limits.exact is None and not plan.keeps_fidelity and plan.target_psnr is None,
             ),
-            f"{pixels:,} pixels of a view become Gaussians: {limits.per_view} for each view,",
-            f"and {limits.default:,} in all. The fit has {plan.fit.steps} steps. It starts with fewer Gaussians,",
+            f"{pixels:,} pixels of a view may become Gaussians: {limits.per_view} for each view,",
+            f"and {limits.default:,} in all. The fit has {plan.fit.steps} steps. Its start is made of only",
+            f"{first} superpixels for each view, and the fit adds Gaussians where renders differ most from the",
             say(
-                f"{first} for each view, and adds the others where the photos show the largest errors.",
+                "photos.",
                 plan.fit.grows and not plan.merges_pairs,
             ),
             say(
@@ -356,7 +357,7 @@ def build_section(run: Run) -> str:
     return "\n\n".join([
         "## 4. build: the arrows",
         text(
-            "[`pipeline.py`](../../gsmerge/pipeline.py) calls the files of `stages/` in turn, and `fit/` after",
+            "[`pipeline.py`](../../gsmerge/pipeline.py) calls the functions of `stages/` in turn, and `fit/` after",
             "`decode_merged`. Each line begins with a function. Not shown are `assign` (a row belongs to the",
             "superpixel of its pixel) and `refine` (only networks refine).",
         ),
@@ -389,15 +390,15 @@ def build_section(run: Run) -> str:
             ),
             f"**`merge`** turns {len(features)} Feature Gaussians into {len(merged)}, one for each cluster; `views` is",
             say("-1 if several views were merged.", int(merged.views[run.merged]) == -1),
-            "**`decode_merged`** makes one Gaussian of each,",
+            "**`decode_merged`** makes one Gaussian of each merged one,",
             say("since K is 1.", plan.decode.k == 1 and len(decoded.gaussians) == len(merged)),
-            "Its opacity keeps the optical depth of the members, times the gain.",
+            "The opacity keeps the optical depth of the members of the cluster, times the gain.",
         ),
         text(
-            "**`fit_scene`** changes all parameters until renders look like the photos. Half way it splits the",
-            "Gaussians with the largest errors, and later it drops faint ones.",
-            f"{len(fitted.gaussians):,} are left, {len(children)} of which come from the pixel's Gaussian.",
-            "The first steps draw a quarter of all pixels, and leave out patches of the photos.",
+            "**`fit_scene`** changes all parameters so that renders look like the photos. Half way the fit splits the",
+            "Gaussians with the largest errors, and later drops faint Gaussians.",
+            f"{len(fitted.gaussians):,} Gaussians are left, {len(children)} of which come from the pixel's Gaussian.",
+            "The first steps draw a quarter of a photo's pixels, and leave out patches of the photos.",
             f"The PSNR of the patches rises from {report.holdout_before:.1f} to {report.holdout_after:.1f} dB,",
             say(
                 "so the fit is accepted.",
@@ -406,8 +407,8 @@ def build_section(run: Run) -> str:
         ),
         text(
             f"**`prune_and_fill`** leaves out {len(before - after)} Gaussians, which change no photo by more than",
-            "rounding does. It adds Gaussians where cameras between the photos see nothing,",
-            say("but here it adds none.", not others),
+            "rounding does, and adds Gaussians where cameras between the photos see nothing,",
+            say("but none in this scene.", not others),
         ),
     ])  # fmt: skip
 
@@ -435,7 +436,7 @@ def result_section(run: Run) -> str:
                 "The result shows the photos better than the input, which has wrong depths.",
                 report.psnr_after > report.psnr_before,
             ),
-            "The fit has seen these photos. So the report also estimates the gain of new views, by",
+            "The fit has seen these photos, so the report also estimates the gain of new views, by",
             say(
                 "fits that leave photos out.",
                 report.worse is None and new.low > 0,

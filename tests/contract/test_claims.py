@@ -84,26 +84,28 @@ def degree(number: int) -> str:
 FIXED = memory.memory_bytes(0)
 CLAIMS: dict[str, tuple[str, ...]] = {
     DECISIONS: (
-        f"It starts with {percent(stage.START)} of the Gaussians, splits those with the largest error"
-        f" {part(schedule.GROWTH)} way, and averages the last {part(RATES.average_share)} of its steps",
-        f"The first {percent(FIT.half_res_part)} of the steps draw a {part(1 / schedule.STRIDE**2)} of the pixels",
+        f"A fit that grows starts with at most {percent(stage.START)} of the Gaussians, splits those with the largest"
+        f" errors {part(schedule.GROWTH)} way, and averages the last {part(RATES.average_share)} of its steps",
+        f"Usually the first {percent(FIT.half_res_part)} of the steps draw a {part(1 / schedule.STRIDE**2)} of the"
+        " pixels",
         f"After {percent(RATES.outside_from)} of the steps, every {word(RATES.outside_every, ordinal=True)} step also"
-        " looks at the scene [from outside]",
-        f"{move_poses.POSE_PIXELS:,} pixels of a view are looked up in {word(move_poses.POSE_NEIGHBOURS)} neighbours",
+        " draws the scene [from outside]",
+        f"{move_poses.POSE_PIXELS:,} pixels of a view are looked up in up to {word(move_poses.POSE_NEIGHBOURS)} other"
+        " views",
         f"bring the greys together at {word(len(move_poses.SIDES))} sizes",
     ),
     LARGE: (
         f"Scenes of more than {million(plan.WHOLE_GAUSSIANS)} Gaussians with pixels are compacted in blocks of views"
         f" (`blocks`): one block for every {million(plan.BLOCK_GAUSSIANS)} Gaussians",
-        f"Scenes of more than {plan.WHOLE_VIEWS} views get one block for every {plan.BLOCK_VIEWS} views, if the blocks"
+        f"Scenes of more than {plan.WHOLE_VIEWS} views get one block for every {plan.BLOCK_VIEWS} views, if blocks"
         f" cut at most a {part(partition.MOST_CUT)}",
-        f"Each block also takes views of its neighbours, a {part(partition.SHARED)} of the number of its own",
+        f"A block also takes views of its neighbours, at most a {part(partition.SHARED)} as many as its own",
         f"A block asks for up to {'twice' if blocks.MOST_DENSITY == 2 else blocks.MOST_DENSITY} as many superpixels",
         f"at {seams.SEAM_RATE:g} times the usual ones, and fall to a tenth",
-        f"{word(seams.SEAM_VIEW_STEPS)} for each photo that shows many of them, or {word(seams.ROOM_VIEW_STEPS)} if at"
-        f" least {part(seams.ROOM_SHARE)} of all Gaussians are at seams",
+        f"{word(seams.SEAM_VIEW_STEPS)} for each photo that shows many such Gaussians, or {word(seams.ROOM_VIEW_STEPS)}"
+        f" if at least {part(seams.ROOM_SHARE)} of all Gaussians are at seams",
         f"The default takes {plan.EFFORTS['default'].steps} steps for up to {plan.USUAL_VIEWS} views",
-        f"A lost block is done again, up to {word(work.RETRIES)} times",
+        f"A block whose process or node was lost is done again, up to {word(work.RETRIES)} times",
         f"| GB per million | {' | '.join(map(degree, range(5)))} |",
     ),
     NETWORKS: (
@@ -113,8 +115,6 @@ CLAIMS: dict[str, tuple[str, ...]] = {
         f" | 1.0 MB, {load_checkpoint(IN_PACKAGE['paper']).networks.num_parameters:,} parameters |",
     ),
     "docs/internals/notebook.md": (
-        f"**Kept**: {plan.EFFORTS['best'].steps} steps for `best`",
-        f"samples for {FIT.half_res_part:g} of the steps".replace(" 0.", " ."),
         f"a weight that grows from 0 to {RATES.edge_weight:g} over the run",
         f"(**kept**: every {word(RATES.outside_every, ordinal=True)}, {outside.PLACES})",
         f"{fit_pairs.RENDERS_STEP:g} / sqrt(share that stays)",
@@ -200,7 +200,7 @@ CLAIMS: dict[str, tuple[str, ...]] = {
     EXPORTERS: (
         f"is at most {part(rows_first._PLAIN_PX)} a pixel in every view",
         f"in every view is at most {score.MAX_MEDIAN_PX:g} pixels (less in small pictures), and a"
-        f" {part(1 / score.SHUFFLED_MARGIN)} of that from shuffled pixels",
+        f" {part(1 / score.SHUFFLED_MARGIN)} of the distance from shuffled pixels",
         f"up to {cameras_off.MAX_PX:g} pixels off (median; {percent(cameras_off.MAX_SHARE)} of the side",
     ),
     FORMATS: (
@@ -222,9 +222,9 @@ CLAIMS: dict[str, tuple[str, ...]] = {
         f"{photo_files._FREE_PHOTOS / 1e6:g} MB + {photo_files._PHOTOS_PER_BYTE} x their bytes",
     ),
     "docs/results.md": (
-        f"Boxes reach to one standard deviation. They match from an IoU of {MatchOptions().iou:g} on, latents from a"
+        f"Boxes reach to one standard deviation. Boxes match from an IoU of {MatchOptions().iou:g} on, latents from a"
         f" cosine of {MatchOptions().similarity:g} on",
-        f"{str(PAPER['superpixels']).replace('%', ' %')} superpixels before merging",
+        f"Superpixels are {str(PAPER['superpixels']).replace('%', ' %')} of the pixels before merging",
     ),
 }
 
