@@ -378,8 +378,8 @@ def build_section(run: Run) -> str:
             f"The pixel lies in superpixel {run.label}, which has {size} pixels.",
             "**`encode`** gives each superpixel a Feature Gaussian with the mean and the covariance of its Gaussians,",
             "weighted by their opacities.",
-            f"**`correct`** lowers the gain of {faint} of the {len(features)}: more views see through these than",
-            say("confirm them, so their depth is likely wrong.", plan.weakens and faint > 0),
+            f"**`correct`** lowers the gain of {faint} of the {len(features)} Feature Gaussians: more views see",
+            say("through these than confirm them, so their depth is likely wrong.", plan.weakens and faint > 0),
         ),
         text(
             "**`match`** finds Feature Gaussians of different views that overlap and have similar colours, and so",

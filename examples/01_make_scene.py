@@ -17,6 +17,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from gsmerge.errors import GsmergeError
 from gsmerge.research.generate import GenerateOptions, NoiseOptions, generate_scene
 
 # The scene is like a usual export: colours do not depend on the view, opacities vary, and lengths are in metres.
@@ -46,7 +47,10 @@ def main() -> None:
     parser.add_argument("--height", type=int, default=160)
     parser.add_argument("--seed", type=int, default=2)
     args = parser.parse_args()
-    out = make_scene(args.out, num_views=args.views, width=args.width, height=args.height, seed=args.seed)
+    try:
+        out = make_scene(args.out, num_views=args.views, width=args.width, height=args.height, seed=args.seed)
+    except GsmergeError as error:  # for example a folder with other contents
+        parser.exit(error.exit_code, f"{error}\n")
     print(f"{out / 'scene.ply'}: {args.views * args.width * args.height} Gaussians, {args.views} views")
 
 

@@ -128,9 +128,9 @@ def _compact(
 
 
 def _choose_levels(args: opt.Args, settings: CompactOptions, outputs: Outputs) -> CompactOptions:
-    """Choose the number of levels by the format of the output; UsageError if the format does not allow the settings.
+    """Choose the number of levels by the format of the output, and check that the format allows the settings.
 
-    A format may have no levels, or no budget in bytes.
+    UsageError if there are several levels, or a budget in bytes, and the format cannot have these.
     """
     from gsmerge.facts.counts import STREAMED_LEVELS
 

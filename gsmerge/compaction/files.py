@@ -54,7 +54,7 @@ def compact_files(
     start, out, settings = perf_counter(), outputs.result, with_output_name(settings, outputs)
     format_ = outputs.format
     with atomic_outputs(overwrite=outputs.overwrite) as add:
-        temporary = add(out)
+        temporary = add(out)  # before the long work, so that an output that cannot be written ends the run at once
         load = read_input(files, opacity=opacity, hints=hints, hashed=hashed)
         on_read(load)
         views = _list_first_layers(load.scene)

@@ -243,7 +243,7 @@ def decode_levels(path: Path, photo: Path | None = None) -> np.ndarray:
 
     def brightness(image: Image.Image) -> np.ndarray:
         """Return the brightness ``[h,w]`` that the file stores, in images of 8 bits times the opacity."""
-        _check_channels(budget, image)
+        _check_pillow_memory(budget, image)
         if image.mode[0] in "IF":  # more than 8 bits
             return np.asarray(image)
         grey = np.empty(image.size[::-1], np.uint8)
@@ -280,7 +280,7 @@ def decode_alpha(path: Path) -> np.ndarray | None:
         """Return the opacities of an image; None if the image has no opacities."""
         if "A" not in image.getbands() and "transparency" not in image.info:
             return None
-        _check_channels(_photo_budget(path), image)
+        _check_pillow_memory(_photo_budget(path), image)
         return image.convert("RGBA").getchannel("A")
 
     values = _decode_channel(path, alpha)
@@ -293,8 +293,8 @@ def _photo_budget(path: Path, *beside: Path) -> ReadBudget:
     return ReadBudget(path, sum(map(check_file, (path, *beside))), _PHOTO_MEMORY_PER_BYTE, _SMALLER)
 
 
-def _check_channels(budget: ReadBudget, image: Image.Image) -> None:
-    """Raise SceneError if Pillow needs more memory to convert an image to one channel than the file allows."""
+def _check_pillow_memory(budget: ReadBudget, image: Image.Image) -> None:
+    """Raise SceneError if Pillow would need more memory than ``budget`` allows to decode and convert an image."""
     pixel_bytes = _PILLOW_BYTES.get(image.mode, 4)
     decoder_bytes = _decoder_bytes(image) + (_PILLOW_WEBP_BYTES if image.format == "WEBP" else 0)
     num_bytes = max(_COPIES[1] * pixel_bytes, pixel_bytes + decoder_bytes) * image.width * image.height

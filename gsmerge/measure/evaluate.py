@@ -362,8 +362,9 @@ def _score_split(
 ) -> dict[str, list[tuple[float, ViewScore]]]:
     """Draw and score all results, one view after the other.
 
-    Returns, by the name of each result, the seconds of drawing and the score of each view. ``kind`` is the name of the
-    split. ``cameras`` has the cameras of the results that were made with other poses than the scene has.
+    Returns, by the name of each result, the seconds of drawing and the score of each view. A split is a set of views:
+    the input views, or held-out ones. ``kind`` is its name. ``cameras`` has the cameras of the results that were made
+    with other poses than the scene has.
     """
     options, names = renderer.options, split.views.names
     lpips_views = pick_views(len(names), options.lpips_views or len(names))

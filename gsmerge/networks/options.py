@@ -78,7 +78,7 @@ class NetworkOptions(Settings):
     def reads_children(self) -> bool:
         """True if heads read the Gaussians that they correct.
 
-        If outputs are absolute, the Gaussians that heads read tell only the group's size.
+        With absolute outputs there are no Gaussians to correct, and heads read only the size of the group.
         """
         return self.group_numbers or not self.makes_children
 

@@ -497,13 +497,15 @@ def _describe_spare(proposal: Proposal, chosen: Sequence[Assignment | None], *, 
 
 
 def describe_missing(names: Sequence[str], stored: CameraFile | SceneError | None, *, is_right: bool) -> str | None:
-    """Describe which views have no camera in the file ``stored``; None if ``stored`` may belong to another scene.
+    """Say which views have no camera in a file, which is why all cameras are estimated instead of read from the file.
+
+    Returns None if there is no such file, if it cannot be read, or if its cameras may be those of another scene.
 
     Args:
         names: Names of the views. A view has the name of its photo, if a photo shows it.
         stored: The cameras of the file, or why the file cannot be read; None if there is no file.
-        is_right: True if the cameras of the file see the Gaussians. If they do not, the file counts only if every
-            camera has the name of a view.
+        is_right: True if the cameras of the file see the Gaussians. Otherwise the cameras are taken for those of the
+            scene only if every camera has the name of a view.
     """
     if not isinstance(stored, CameraFile):
         return None

@@ -151,10 +151,10 @@ def limit_photo_size(
 
 
 def limit_view_size(cameras: Cameras, images: np.ndarray, max_side: int) -> tuple[Cameras, np.ndarray, list[str]]:
-    """Resize cameras and photos ``[c,h,w,3]`` to at most ``max_side`` pixels per side; return them and a note.
+    """Resize cameras and photos ``[c,h,w,3]`` to at most ``max_side`` pixels per side; return them and notes.
 
-    The function :func:`gsmerge.measure.sizes.shrink_views` chooses the same size, but resizes photos as renders are
-    resized. :func:`limit_view_size` resizes photos as the photos of files are resized.
+    The photos look as if they had been read from files at this size. Where photos are compared with renders of another
+    size, :func:`gsmerge.measure.sizes.shrink_views` serves instead, and resizes photos as it resizes renders.
     """
     transform, notes = _choose_reduction((cameras.width, cameras.height), max_side)
     if transform is not None:

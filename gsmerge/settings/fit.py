@@ -23,7 +23,7 @@ GROW_ROUNDS = 2
 class Tuning:
     """Constants of the fit, which were chosen on training scenes.
 
-    Users cannot set these constants, but runs change a few of them.
+    Runs change a few of them. A user sets only those for which :class:`FitOptions` has an option of its own.
     """
 
     means_lr: float = 0.1  # Step size of a mean, in units of the Gaussian's size

@@ -64,7 +64,7 @@ def _find_limit(gaussians: Gaussians, peaks: np.ndarray, photos: Photos) -> floa
         shown = peaks >= limit
 
         def compare(view: int, image: np.ndarray, transmittance: np.ndarray) -> float:
-            """Return the mean squared change of a render from that of all Gaussians."""
+            """Return the mean squared difference between a render and the render of all Gaussians."""
             return float(((clip(view, image, transmittance) - whole[view]) ** 2).mean(dtype=np.float64))
 
         return math.sqrt(max(photo_errors(splats, photos, compare, keep=lambda _: shown)))

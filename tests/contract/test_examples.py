@@ -89,3 +89,13 @@ def test_the_same_seed_makes_the_same_scene(root: Path, tmp_path: Path) -> None:
     scene = tmp_path / "scene"
     first, again = ((make_scene(scene, seed=0, **sizes) / "scene.ply").read_bytes() for _ in range(2))
     assert first == again
+
+
+def test_a_scene_is_not_made_in_a_folder_with_other_contents(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "scene.ply").touch()
+    monkeypatch.setattr(sys, "argv", ["01_make_scene.py", str(tmp_path)])
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_path(str(root / "examples" / "01_make_scene.py"), run_name="__main__")
+    assert (ended.value.code, capsys.readouterr().err.count("\n")) == (2, 1)

@@ -226,9 +226,9 @@ def keep_common(scenes_of: Mapping[K, set[str]]) -> dict[K, set[str]]:
 
 
 def _point_intervals(columns: Sequence[ByScene]) -> list[Interval]:
-    """Compute the mean score of each point, with an interval as in :func:`paired_intervals`.
+    """Compute the mean score of each point over its scenes, with a confidence interval for comparing the points.
 
-    If points differ in their scenes, intervals have the width 0.
+    The intervals are those of :func:`paired_intervals`. If points differ in their scenes, intervals have the width 0.
     """
     if columns and all(column.keys() == columns[0].keys() for column in columns):
         values = [[column[scene][1] for column in columns] for scene in sorted(columns[0])]
