@@ -31,7 +31,7 @@ from gsmerge.errors import SceneError
 from gsmerge.io.bounds import walk_files
 from gsmerge.types import StrPath
 
-# Numbers of OSErrors that the disk causes while a file is written. OSErrors with other numbers come from the caller
+# Numbers of OSErrors that the disk causes while a file is written. Other OSErrors are raised by the caller's own code
 _DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS}
 # Problem and remedy in the error for an output that exists
 _EXISTS = "exists already", "choose another name, or pass --overwrite (in Python overwrite=True)"

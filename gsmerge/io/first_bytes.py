@@ -79,7 +79,7 @@ OTHER_PICTURES: tuple[tuple[str, tuple[str, ...], str], ...] = (
     ("TIFF", (".tif", ".tiff"), r"II[*+]\0|MM\0[*+]"),
 )
 CONVERT = "convert it to .jpg or .png"
-# If several rows match a file, the first of these rows says what the file is
+# If several entries of this table match a file, the first of these entries says what the file is
 OTHER_CONTENTS = (
     OtherContent("a Git LFS pointer", r"version https://git-lfs\.github\.com/spec/", "fetch it with: git lfs pull"),
     OtherContent(

@@ -84,8 +84,8 @@ def _find_matches(by_ending: dict[str, list[Path]], name: str) -> list[Path]:
 def propose_images(root: Path, files: Sequence[Path], names: Sequence[str], pixels: PixelCount) -> list[Path | None]:
     """Propose one of ``files`` below a folder for each name; None if no file matches the name.
 
-    Of several files that match a name, a file whose whole path is in the name is preferred. A file outside of hidden
-    folders is the second choice, and the file with the most ``pixels`` the third choice.
+    Of several files that match a name, a file whose whole path is in the name is preferred. Otherwise a file outside of
+    hidden folders is preferred, and then the file with the most ``pixels``.
     """
     by_ending = _files_by_ending(root, files)
 
@@ -120,8 +120,8 @@ def match_masks(
     """Find the mask of every view by the name of its photo, with or without extension; None for a view without a mask.
 
     Also return a list of notes. A note names masks that belong to no view, or says that no view has a mask. Raise
-    SceneError if a view has two masks, or if the user ``named`` the folder and no view has a mask; the error names the
-    ``option``.
+    SceneError if a view has two masks, or if no view has a mask and ``named`` is True, which means that the user named
+    the folder; the error names the ``option``.
     """
 
     def is_of_neighbour(mask: Path, photo: Path) -> bool:
@@ -167,8 +167,8 @@ def check_photo_folder(path: Path) -> None:
 def describe_unread(folder: Path, places: Sequence[str]) -> list[str]:
     """Return a note on pictures or videos that cannot be read, in the sub-folders ``places`` or in the folder itself.
 
-    The note describes the first of the folders with unreadable pictures or videos. The list is empty if no folder has
-    any.
+    The note describes only the first folder that has unreadable pictures or videos. The list is empty if no folder has
+    such files.
     """
     for place in (*(folder / name for name in places), folder):
         with suppress(OSError):

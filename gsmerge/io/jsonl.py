@@ -47,8 +47,8 @@ def _parse(line: bytes, budget: ReadBudget) -> dict[str, Any] | None:
 def append_line(path: Path, value: Mapping[str, Any]) -> None:
     """Append one JSON line and wait until it is on the disk.
 
-    The new line replaces an incomplete last line, which a killed process left. If the disk is full, the lines before
-    stay. Raise SceneError if the file cannot be written, ValueError if a value is NaN or inf.
+    The new line replaces an incomplete last line, which a killed process left. If the disk is full, all earlier lines
+    stay in the file. Raise SceneError if the file cannot be written, ValueError if a value is NaN or inf.
     """
     line = json.dumps(value, separators=(",", ":"), ensure_ascii=True, allow_nan=False).encode("ascii") + b"\n"
     try:

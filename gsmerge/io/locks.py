@@ -29,8 +29,8 @@ def lock_file(path: Path, *, wait: bool = True) -> Iterator[bool]:
     try:
         yield True
     finally:
-        # The lock file is removed before the release, so that a waiting process notices that its file is no longer the
-        # lock file
+        # The lock file is removed before the lock is released, so that a waiting process notices that its open file is
+        # no longer the lock file
         with suppress(OSError):  # an open file on Windows, which the release removes
             path.unlink()
         lock.release()

@@ -33,7 +33,7 @@ class PointsOnly:
 _TRAIN_OR_NAME = "train Gaussians on it, or name the .ply of a model, and this file with --cameras"
 # What a folder of photos contains, and the remedy
 _PHOTOS = "photos", "make Gaussians from the photos first, with a model such as Depth Anything 3 or AnySplat"
-# If several rows match a folder, the first of these rows says what the folder contains
+# If several entries of this table match a folder, the first of these entries says what the folder contains
 POINTS_ONLY = (
     PointsOnly(
         "Depth Anything 3",
@@ -107,7 +107,7 @@ def _describe_content(folder: Path) -> tuple[str, str] | None:
 
 
 def check_scene_file(path: Path) -> None:
-    """Raise SceneError, with a remedy, for a file without Gaussians whose ending, like ``.npz``, allows Gaussians."""
+    """Raise SceneError, with a remedy, for a file without Gaussians whose ending may have them, such as ``.npz``."""
     suffix = path.suffix.lower()
     if suffix not in SEVERAL_USES or check_file(path) == 0 or may_hold_gaussians(path):
         return

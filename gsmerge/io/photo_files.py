@@ -43,8 +43,8 @@ _COEFFICIENT_BYTES, _WEBP_BYTES, _MOVING_WEBP_BYTES, _PILLOW_WEBP_BYTES = 2, 4, 
 # First bytes of an image file -> the plugin of Pillow that opens the file
 _PLUGINS = {PNG: "Png", _JPEG: "Jpeg", b"RIFF": "WebP", b"BM": "Bmp"}
 _CHANNELS = 3  # bytes of a decoded photo's pixel
-# Most bytes of a scene's decoded photos: for any files, and in addition for each byte of the files. Even strongly
-# compressed photos have more than 3 / 100 bytes per pixel, so that their 3 bytes in memory are allowed
+# Limit of the bytes of a scene's decoded photos: a constant, plus a number of bytes for each byte of the photos' files.
+# A decoded pixel has 3 bytes, and even strongly compressed files have more than 3 / 100 bytes per pixel
 _FREE_PHOTOS, _PHOTOS_PER_BYTE = 512_000_000, 100
 _SMALLER = "reduce its size: a mask to that of its photo, a photo to about that of its view"
 _BAND = 256  # rows of a mask that are converted at once
@@ -129,7 +129,7 @@ def decode_photos(paths: Sequence[Path | None], turns: Sequence[int], size: Size
     _check_total_memory([path for path in paths if path is not None], sum(map(check_file, files)), size)
 
     def decode(view: tuple[Path | None, int]) -> np.ndarray:
-        """Decode, turn, cut and resize the photo of one view, which is the photo's path and turn."""
+        """Decode, turn, cut and resize the photo of a ``view``, given as the photo's path and turn."""
         path, turn = view
         if path is None:
             return np.zeros((size[1], size[0], 3), np.uint8)
@@ -148,8 +148,8 @@ def decode_photos(paths: Sequence[Path | None], turns: Sequence[int], size: Size
 def decode_small(path: Path, side: int) -> np.ndarray:
     """Decode a small version of a photo to ``[h,w,3]`` float32 sRGB in [0, 1].
 
-    The longer side then has ``side`` to twice ``side`` pixels. A photo with a longer side below ``side`` keeps its
-    size. The orientation tag is ignored. JPEG files are decoded at a reduced size, which is fast.
+    The longer side of the small version has ``side`` to twice ``side`` pixels. A photo whose longer side is below
+    ``side`` keeps its size. The orientation tag is ignored. JPEG files are decoded at a reduced size, which is fast.
     """
     width, height = image_size(path)
     divisor = next(divisor for divisor in reversed(_REDUCTIONS) if max(width, height) >= divisor * side or divisor == 1)
@@ -513,7 +513,7 @@ class PhotoTransform:
 
 
 def limit_size(size: Size, side: int) -> Size:
-    """Shrink a size in proportion until the longer side has ``side`` pixels; a size below that stays unchanged."""
+    """Shrink a size in proportion until the longer side has ``side`` pixels; smaller sizes stay unchanged."""
     if max(size) <= side:
         return size
     scale = side / max(size)

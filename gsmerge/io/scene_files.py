@@ -45,9 +45,9 @@ from gsmerge.types import StrPath
 _check_scene_file = LazyFunction("gsmerge.io.no_gaussians", "check_scene_file")
 _no_gaussians = LazyFunction("gsmerge.io.no_gaussians", "no_gaussians")
 _holds_views = LazyFunction("gsmerge.io.formats.gsm", "holds_views")
-# Places of a scene's .ply in a folder. The first place with a scene is read, or else the folder's only .ply
+# Paths in a folder at which a scene's .ply may lie. The first path with a scene is read, or else the folder's only .ply
 PLY_PLACES = ("scene.ply", "gaussians.ply", "gs_ply/0000.ply", "point_cloud.ply")
-# Places where INRIA and gsplat write trained scenes. Of several trained scenes, the scene after the most steps of
+# Places where INRIA and gsplat write trained scenes. Of several trained scenes, the scene with the most steps of
 # training is read
 TRAINED_PLACES = ("point_cloud/iteration_*/point_cloud.ply", "ply/point_cloud_*.ply")
 SCENES_PLACE = "gaussians"  # folder where DepthSplat and its relatives write NAME.ply; the photos are in images/NAME
@@ -61,7 +61,7 @@ _OTHER_PICTURES = {"masks", "targets"}  # folders of pictures that are no photos
 _POINT_CLOUDS = {"input.ply", "points3D.ply", "points.ply", "sparse_pc.ply"}  # names of point clouds of other programs
 _NUMBERED = re.compile(r"(.*?)[-_. ]?(\d+)\.ply")
 _STEPS = re.compile(r"(?:iteration|point_cloud)_(\d+)(?:\.ply|[\\/]point_cloud\.ply)$")
-# Ends of paths that are equal in all scenes of a program, so that they do not name a scene
+# Ends of paths that a program gives to all its scenes, so that these ends do not name a scene
 _USUAL_END = re.compile(
     r"/(?:(?:exports/)?gs_ply/\d+|(?:point_cloud/iteration_\d+/)?point_cloud|ply/point_cloud_\d+|scene|gaussians)$"
 )
@@ -92,21 +92,21 @@ class SceneFiles:
     num_copies: int = 0  # number of other files in the folder with the same bytes as ``ply``
     named: frozenset[str] = frozenset()  # names of the fields that the caller set, so that they are not searched
     photo_option: str = "--images"  # option with which the user names the folder of ``images``
-    # Photos, cameras and masks that the scene lacks, and that lie in the folder above it: the option and the path of
-    # each. A note names these paths, but they are never read
+    # Photos, cameras and masks in the folder above the scene, if the scene lacks them: the option and the path of each.
+    # A note names these paths, but gsmerge never reads them
     above: tuple[tuple[str, Path], ...] = ()
-    others: tuple[Path, ...] = ()  # further cameras, which are tried in turn if ``cameras`` do not fit
+    others: tuple[Path, ...] = ()  # further camera files, tried in turn if ``cameras`` do not fit
     below: bool = False  # True: ``others`` are in folders below, and are read only if photos show that they fit
     root: Path | None = None  # the scene's own folder
 
     @property
     def plys(self) -> tuple[Path, ...]:
-        """Paths of the files of Gaussians, in the order of their rows."""
+        """Paths of the scene's files of Gaussians, in the order in which they are read."""
         return self.parts or (self.ply,)
 
     @property
     def all_plys(self) -> tuple[Path, ...]:
-        """Paths of the files of Gaussians of this scene and of ``more``, in the order of their rows."""
+        """Paths of all files of Gaussians, first of this scene, then of the scenes in ``more``."""
         return tuple(ply for files in (self, *self.more) for ply in files.plys)
 
     @property
@@ -117,9 +117,9 @@ class SceneFiles:
 
     @property
     def choices(self) -> list[SceneFiles]:
-        """Return a copy of the scene's files for each camera file to try, in the order of the tries.
+        """Return a copy of this object for each camera file to try, in the order in which they are tried.
 
-        Cameras in folders below the scene are tried only if one folder has them all, since several folders may be
+        Cameras in sub-folders are tried only if one sub-folder has them all, since several sub-folders may be several
         scenes.
         """
         if self.below and len({Path(os.path.relpath(path, self.root)).parts[0] for path in self.others}) > 1:
@@ -129,9 +129,9 @@ class SceneFiles:
         return [self, *(replace(self, cameras=path, images=images, above=()) for path in self.others)]
 
     def describe_choice(self, cameras: Path | None) -> list[str]:
-        """Return a list with a note that ``cameras`` are read and no others; empty if there are no other cameras.
+        """Return a list with a note that ``cameras`` are read and other cameras are not; empty without other cameras.
 
-        Other cameras are those that were tried before, and COLMAP models beside the model that is read.
+        The note names cameras that were tried before ``cameras``, and COLMAP models beside the model that is read.
         """
         if cameras is None or not self.others:
             return []
@@ -150,12 +150,12 @@ class SceneFiles:
 
     @property
     def is_state(self) -> bool:
-        """Return whether the file is a state (``.gsm``), whose Gaussians have no pixels."""
+        """Return whether the scene is a state (``.gsm``), whose Gaussians belong to no pixels of photos."""
         return self.ply.suffix.lower() == STATE_ENDING
 
     @property
     def base(self) -> Path:
-        """Path from which the names of results are made: the file, or ``scene.ply`` beside several parts."""
+        """Path that names results: the scene's file, or ``scene.ply`` beside it if the scene has several files."""
         return self.ply.with_name("scene.ply") if self.parts else self.ply
 
     @property
@@ -188,7 +188,7 @@ def find_scene_files(
     protect: StrPath | None = None,
     within: StrPath | None = None,
 ) -> SceneFiles:
-    """Find a scene's files from its path. Files that the caller names, or leaves out by "none", are not searched.
+    """Find a scene's files from its path. Files that the caller names, or excludes by "none", are not searched for.
 
     Folders are searched in this order:
 
@@ -198,17 +198,17 @@ def find_scene_files(
       ``point_cloud/iteration_n/``, also the folder that has ``point_cloud/``;
     - for cameras and photos, the folder of the file to which the ``.ply`` links;
     - for cameras and photos, the folders above the ``.ply`` up to ``within``;
-    - for cameras, if no folder above this line has cameras, the folders below the given folder.
+    - the folders below the given folder, but only for cameras, and only if the folders listed before have no cameras.
 
-    A folder that has Gaussians of its own is a scene, and no file in it belongs to another scene. Masks are searched
-    beside the photos that are read, and in the folders of the first two list items.
+    A folder with Gaussians is a scene, and no file in it belongs to another scene. Masks are searched for beside the
+    photos that are read, and in the folders of the first two list items.
 
     In each folder the places of ``PLY_PLACES``, ``CAMERA_PLACES``, ``IMAGE_PLACES`` and ``MASK_PLACES`` are tried in
-    their order. ``NAME.cameras.json``, the cameras of a result, come first, but last if they may belong to another file
-    than NAME. Of several COLMAP models in one place, the model with the most images comes first. Cameras inside the
-    ``.ply`` precede cameras beside it. If no place has cameras, the only file that holds cameras is taken, whatever its
-    name. If no file holds cameras, a file of cameras of an unsupported program is taken, and its reader names the
-    program. Images inside the cameras' ``.npz`` precede a folder of images, because the networks saw the images inside.
+    their order. Cameras of a result, in ``NAME.cameras.json``, come first, but come last if they may belong to another
+    file. Of several COLMAP models in one place, the model with the most images comes first. Cameras inside the ``.ply``
+    precede cameras beside it. If no place has cameras, the only file that holds cameras is taken, whatever its name. If
+    no file holds cameras, a file of cameras of an unsupported program is taken, and its reader names the program.
+    Images inside an ``.npz`` of cameras precede a folder of images, because the network saw the images in the ``.npz``.
     A result of gsmerge is taken as the scene only if a folder has no other scene.
 
     Raises:
@@ -255,7 +255,7 @@ def find_scene_files(
 
 
 def _find_camera_paths(ply: Path, roots: Sequence[Path]) -> tuple[Path | None, list[Path], bool]:
-    """Return a scene's cameras or None, a list of further cameras, and whether the further ones are in folders below.
+    """Return a scene's cameras or None, a list of further cameras, and whether these lie in folders below the scene.
 
     The cameras are in the order that :func:`find_scene_files` describes. Folders below the scene are searched only if
     there are no cameras beside the scene.
@@ -325,8 +325,7 @@ def _find_above(files: SceneFiles, roots: Sequence[Path]) -> tuple[tuple[str, Pa
     Files of a neighbouring scene do not count. Masks count only if they have the names of the scene's photos. Return
     each path that was found, after its option.
     """
-    # The least of the roots that contain the scene is the uppermost, since a folder's path sorts before the paths
-    # inside
+    # The uppermost folder is found by ``min``, since the path of a folder sorts before the paths in it
     folder = min(filter(Path(os.path.realpath(files.ply)).is_relative_to, roots), default=roots[0]).parent
     places = dict[str, Path | None]()
     with suppress(SceneError, OSError):
@@ -353,8 +352,8 @@ def _search_roots(path: Path, ply: Path, within: StrPath | None) -> tuple[list[P
     own = [Path(os.path.realpath(given_folder)), folder, *program_folders]
     own += _list_between(folder, Path(os.path.realpath(path)))
     above = _list_between(folder, Path(os.path.realpath(within or folder)))
-    # A folder that has a scene with a usual name is not shared with the scenes below, since its files belong to that
-    # scene
+    # A folder with a scene of a usual name is not searched for other scenes, since its photos and cameras belong to
+    # that scene
     shared = [Path(os.path.realpath(ply)).parent, *(place for place in above if named_ply(place) is None)]
     return list(dict.fromkeys(own)), [place for place in dict.fromkeys(shared) if place not in own]
 
@@ -372,7 +371,7 @@ def _list_between(folder: Path, top: Path) -> list[Path]:
 
 
 def scene_title(ply: Path) -> str:
-    """Return a scene's name for a page: that of the file, or of the folder if a program names all its files alike."""
+    """Return a scene's name for a page: the name of the file, or of its folder if the program names all files alike."""
     path = ply.absolute().with_name(ply.stem.removesuffix(".compact")).as_posix()
     return Path(_USUAL_END.sub("", path)).name or ply.stem
 
@@ -380,7 +379,7 @@ def scene_title(ply: Path) -> str:
 def result_cameras(ply: Path) -> Path | None:
     """Find the cameras that gsmerge wrote beside a result; None if there are none.
 
-    A level of detail without cameras has the cameras of the result to which it belongs. If a ``.ply`` of another
+    For a level of detail that has no camera file, the camera file of the full result is taken. If a ``.ply`` of another
     program has a result of the same name beside it, such as ``scene.sog`` beside ``scene.ply``, the cameras belong to
     the result.
     """
@@ -391,7 +390,7 @@ def result_cameras(ply: Path) -> Path | None:
 
 
 def _rate_camera_file(ply: Path) -> int:
-    """Rate how surely ``NAME.cameras.json`` has the cameras of the file called NAME: 2 is sure, 0 is no.
+    """Rate by 0 to 2 points how surely ``NAME.cameras.json`` has the cameras of the file ``ply`` called NAME.
 
     A ``.ply`` gets one point if gsmerge wrote it, and one point if no file of another format has the same name. A
     result gets both points. A file of another format than ``.ply`` gets both points, too, since its header does not say

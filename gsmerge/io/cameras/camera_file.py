@@ -19,8 +19,8 @@ from gsmerge.settings.reading import Order
 from gsmerge.types import Cameras, StrPath
 from gsmerge.values.arguments import check_arguments
 
-# Largest number in poses and intrinsics, largest side of an image, and smallest focal length, in pixels. Real cameras
-# keep these three limits, and numbers beyond the limits would overflow in later steps
+# Largest number in poses and intrinsics, largest side of an image, and smallest focal length, in pixels. Cameras beyond
+# these three limits are not real, and their numbers would overflow in later steps
 MAX_NUMBER, _MAX_SIDE, _MIN_FOCAL = 1e12, 1e6, 1e-6
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # turns OpenGL's camera axes (y up, z backward) to OpenCV's (y down, z forward)
 
@@ -45,8 +45,8 @@ COEFFICIENTS = {  # names of the coefficients of each model of lens, in order
     "fisheye": ("k1", "k2", "k3", "k4"),
 }
 # If a smaller share of an undistorted photo's pixels lies within the original photo, the coefficients of the lens are
-# wrong. A lens with k1 = 1 / r^2, where r is half of the image's diagonal, is stronger than any real lens, and even
-# with this lens a third of the pixels lies within the photo
+# wrong. No real lens is as strong as k1 = 1 / r^2, where r is half of the image's diagonal, and even for k1 = 1 / r^2 a
+# third of the undistorted photo's pixels lies within the original photo
 _MIN_INSIDE = 0.25
 
 
@@ -83,8 +83,8 @@ class CameraFile:
     has_intrinsics: bool = True  # False: the file has only poses, and `Ks` are placeholders
     # Size of the photos, and the transform from the photos' size to the cameras' size. None before the photos are known
     photo_map: tuple[Size, PhotoTransform] | None = None
-    # ``[n]`` the pixel ``(view·H + y)·W + x`` of each Gaussian, -1 for a Gaussian without a pixel. None unless the
-    # cameras were estimated from the order of the Gaussians' rows
+    # ``[n]`` the pixel ``(view·H + y)·W + x`` of each Gaussian, -1 for a Gaussian without a pixel. None if the cameras
+    # were not estimated from the order of the Gaussians' rows
     pixel_ids: np.ndarray | None = None
 
     def __len__(self) -> int:
@@ -114,8 +114,8 @@ class StoredView(NamedTuple):
 
     name: str  # of its image
     pose: np.ndarray  # 3x4 or 4x4, in the file's convention
-    # ``[3,3]`` intrinsics in pixels, or divided by the image's size, or None. All views of a file have the same kind of
-    # K
+    # ``[3,3]`` intrinsics in pixels, or divided by the image's size, or None. All views of a file have K in pixels, or
+    # all have K divided by the size, or none has K
     K: np.ndarray | None
     size: tuple[int, int] = (0, 0)  # (width, height), pixels; 0 where unknown
     lens: Lens | None = None  # None for a pinhole
@@ -306,11 +306,11 @@ def sizes_of(camera_file: CameraFile) -> list[tuple[int, int]]:
 
 
 def at_own_size(camera_file: CameraFile, size: tuple[int, int] | None) -> CameraFile:
-    """Give cameras without a size twice their principal point as the size, if the photos have another size.
+    """Set the size of cameras without a size to twice their principal point, if the photos have another size.
 
-    ``size`` is (width, height) of the photos. Cameras stay unchanged if twice the principal point has another aspect
-    ratio than the photos, or nearly the same size. Sides with a fraction are rounded to multiples of ``PATCH_SIDE``, as
-    the sides of networks' inputs are.
+    ``size`` is (width, height) of the photos. Cameras stay unchanged if twice the principal point differs from the
+    photos in aspect ratio, or is nearly the photos' size. Sides with a fraction are rounded to multiples of
+    ``PATCH_SIDE``, as the sides of networks' inputs are.
     """
     if size is None or _stored_sizes(camera_file) != [(0, 0)]:
         return camera_file

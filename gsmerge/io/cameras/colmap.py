@@ -125,9 +125,9 @@ def _make_view(path: Path, camera_id: int, model: str, size: tuple[int, int], pa
 def _size_for_intrinsics(K: np.ndarray, size: tuple[int, int]) -> tuple[int, int]:
     """Return the image size to which intrinsics belong: the stored size, or the size of WorldMirror 1's input.
 
-    WorldMirror 1 stores the size of the photos, but intrinsics for its input. Twice the principal point is then the
-    size of the input, if this size has whole numbers, is clearly smaller than the photos, and has the photos' aspect
-    ratio.
+    WorldMirror 1 stores the size of the photos, but intrinsics for the smaller images that the network reads. Twice the
+    principal point is taken as the size of these images if it has whole numbers, is clearly smaller than the photos,
+    and has the photos' aspect ratio.
     """
     sides = 2 * K[:2, 2]
     ratio_x, ratio_y = sides / np.maximum(size, 1)
@@ -208,7 +208,8 @@ def _text_images(path: Path, lines: Iterable[str], cameras: Mapping[int, StoredV
 
 
 def _lists_points(line: str, cameras: Mapping[int, StoredView]) -> bool:
-    """Return whether the line after an image lists points, each as x, y and an id, and is no other image.
+    """Return whether the line after that of an image lists points, each as x, y and an id, rather than being the next
+    image.
 
     The line of an image has ten words: its id, a quaternion, a translation, the id of a camera, and a name.
     """

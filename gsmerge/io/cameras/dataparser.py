@@ -25,10 +25,10 @@ def read_dataparser(ply: Path, cameras: Path | None) -> list[Similarity]:
     """Return the similarities by which nerfstudio or a survey may have moved the cameras. The caller tries each one.
 
     Nerfstudio's ``dataparser_transforms.json`` has the map from the world of the capture into the world of the
-    Gaussians: X' = scale (transform [X; 1]). The poses of a ``transforms.json`` with an ``applied_transform`` (and
-    ``applied_scale``) are already moved by ``applied_transform``. A second similarity therefore undoes
-    ``applied_transform`` before the map. If nerfstudio's file is missing, offsets of surveys are read. Raise SceneError
-    if nerfstudio's map is not a rotation, a shift and a positive scale.
+    Gaussians: X' = scale (transform [X; 1]). If a ``transforms.json`` has an ``applied_transform`` (and
+    ``applied_scale``), its poses are already moved by ``applied_transform``. A second similarity is therefore returned,
+    which undoes ``applied_transform`` before it applies the map. If nerfstudio's file is missing, offsets of surveys
+    are read. Raise SceneError if nerfstudio's map is not a rotation, a shift and a positive scale.
     """
     folders = [ply.parent] + ([] if cameras is None else [cameras.parent])
     path = next((folder / DATAPARSER for folder in folders if (folder / DATAPARSER).is_file()), None)

@@ -46,7 +46,7 @@ CAMERA_PLACES = (
     "camera_poses.txt", "keyframes/corrected_cameras", "keyframes/cameras", "reconstruction.json",
     "opensfm/reconstruction.json", "cameras.xml", "[0-9]*", ".",
 )  # fmt: skip
-# If several rows match a file, the first of these rows names the file's program
+# If several entries of this table match a file, the first of these entries names the file's program
 PROGRAMS = (
     Foreign("*.csv *.xmp", *_REALITY, r"#(name|cameras)|xcr:"), Foreign("*.rcproj *.rsproj", *_REALITY),
     Foreign("*.psx *.psz", "Metashape", "File > Export > Export Cameras writes the .xml that is read"),
@@ -102,7 +102,7 @@ def check_program(place: Path) -> None:
 
 
 def find_unread(place: Path) -> Path | None:
-    """Find a file of :data:`PROGRAMS`: the path itself, or a file below it, but not in the folder of another scene."""
+    """Find a file of :data:`PROGRAMS`: the path itself, or a file below it, but none in the folder of another scene."""
     paths = (path for depth in range(_DEPTH) for path in place.glob("*/" * depth + "[!.]*"))
     files = sorted(islice(paths, _MAX_PATHS)) if place.is_dir() else [place]
     scenes = {p.parent for p in files if p.suffix == ".ply" and p.parent != place and header_content(p) == "Gaussians"}

@@ -47,11 +47,11 @@ def is_da3(path: Path) -> bool:
 def read_da3(source: CameraSource) -> StoredCameras:
     """Read the cameras of an ``.npz`` of Depth Anything 3, and its images if it has any.
 
-    Poses are 3x4 or 4x4, world to camera. Intrinsics that are divided by the size, or are for another size, are scaled
-    to pixels of the images or depth maps. Depth Anything 3 stores intrinsics for another size if it exports a COLMAP
-    model in the same call. Files of Lyra 2 (``cameras.npz``), VGGT and AnySplat are also read. Poses of AnySplat are
-    camera to world, its intrinsics are divided by the size, and its arrays are a batch of one. Raise SceneError if the
-    file cannot be read or lacks an array.
+    Poses are 3x4 or 4x4, world to camera. Intrinsics that are divided by the image size, or are for another image size,
+    are scaled to pixels of the images or depth maps in the file. Depth Anything 3 stores intrinsics for another image
+    size if it exports a COLMAP model in the same call. Files of Lyra 2 (``cameras.npz``), VGGT and AnySplat are also
+    read. Poses of AnySplat are camera to world, its intrinsics are divided by the size, and its arrays are a batch of
+    one. Raise SceneError if the file cannot be read or lacks an array.
     """
     path = source.path
     size_names = () if holds_images(path) else _DEPTHS  # without images, the shape of depth maps gives the size
@@ -158,17 +158,17 @@ def _as_images(path: Path, images: np.ndarray, count: int) -> np.ndarray:
 
 
 def _at_size(Ks: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Scale intrinsics that are divided by the image size, or are for another size, to ``width`` and ``height``.
+    """Convert intrinsics divided by the image size, or for another image size, to pixels of ``width`` x ``height``.
 
     The networks put the principal point in the middle of the image. Twice the principal point is thus the image size to
-    which intrinsics belong.
+    which a view's intrinsics belong.
     """
     size = np.array([width, height])
     least_centre = 1e-9  # smaller principal points are raised to this, since a later line divides by them
     ratios = 2 * np.maximum(Ks[:, :2, 2], least_centre) / size  # size of the intrinsics, divided by that of the images
     is_normalised = (Ks[:, 0, 0] < MAX_NORMALISED_FOCAL) & (Ks[:, 0, 2] < 2) & (width > 10)
-    # If the ratios of both axes are equal, but are not 1, the intrinsics are for another size. If the two ratios
-    # differ, the principal point is not in the middle
+    # If a view's two ratios, for width and height, are equal but not 1, its intrinsics are for another image size. If
+    # the two ratios differ, the principal point is not in the middle of the image
     max_axis_difference, min_size_difference = 0.03, 0.1  # relative
     are_equal = np.abs(ratios[:, 0] / ratios[:, 1] - 1) < max_axis_difference
     is_for_other_size = ~is_normalised & are_equal & (np.abs(ratios[:, 0] - 1) > min_size_difference)

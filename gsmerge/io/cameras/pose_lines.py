@@ -30,7 +30,8 @@ def read_poses(source: CameraSource) -> StoredCameras:
     """Read the cameras of a text file, each line of which has the 12 or 16 numbers of a pose, row by row.
 
     The file :data:`INTRINSICS` beside it may have one line of intrinsics for all views, or a line for each view. The
-    size of the views is unknown. Raise SceneError if a line has another count of numbers than stated here.
+    size of the views is unknown. Raise SceneError if a line of poses has other than 12 or 16 numbers, or a line of
+    intrinsics other than 4.
     """
     path, intrinsics = source.path, source.path.parent / INTRINSICS
     poses = _parse(path, read_lines(path), _POSE_COLUMNS)

@@ -47,7 +47,7 @@ def _is_camera_folder(folder: Path) -> bool:
 
 
 def find_other_cameras(folder: Path) -> Path | None:
-    """Find the only file of any name in a folder that can be read as cameras; None if no file or several can.
+    """Find a folder's only file that can be read as cameras, whatever its name; None if there is none, or several.
 
     Files of intrinsics beside poses, and cameras that gsmerge wrote for viewers, are left out.
     """

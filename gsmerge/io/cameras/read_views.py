@@ -26,7 +26,7 @@ from gsmerge.kernels.elementary import cos, sin
 
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")  # the order of nerfstudio's "distortion_params"
 _COEFFICIENTS = (*_DISTORTION, "k5", "k6")
-# Camera models with distortion, and all models that are read, without OPENCV_FISHEYE
+# Camera models with distortion, and then all models that are read. Both sets lack OPENCV_FISHEYE
 _DISTORTED = {"OPENCV", "RADIAL", "SIMPLE_RADIAL"}
 _PINHOLE_OR_OPENCV = {"PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", *_DISTORTED}
 _FOCAL = ("fx", "fy", "angle_x", "angle_y")  # values from which a focal length follows

@@ -141,7 +141,7 @@ SHARP_PLY = CameraFormat(
     SHARP, "inside the `.ply` of SHARP", ".ply", lambda file: read_sharp(file) or StoredCameras([]), W2C_OPENCV,
     "pixels of the photo", lambda file: read_sharp(file) is not None,
 )  # fmt: skip
-# A camera file is read by the first row that has the file's ending and recognises the file
+# A camera file is read by the first format of this table that has the file's ending and recognises the file
 CAMERA_FORMATS = (
     CameraFormat("COLMAP binary", "COLMAP: `cameras.bin` and `images.bin`", "", partial(_READ_COLMAP, suffix=".bin"),
                  W2C_OPENCV, "pixels; lenses", lambda file: _holds_model(file.path, ".bin")),

@@ -34,7 +34,8 @@ class Matrix:
 
     Args:
         key: The key.
-        shape: Shape of the matrix if files may list its numbers without rows. None if files list the matrix row by row.
+        shape: Shape of the matrix, if files may list all its numbers in one flat list. None if files have a list for
+            each row.
     """
 
     key: str
@@ -117,7 +118,7 @@ class PinholeKeys:
 
 @dataclass(frozen=True)
 class ViewLayout:
-    """A description of where a file lists its views, and of the keys under which a view has its values.
+    """Where a file lists its views, and the keys under which each view has its values.
 
     A value of null counts as missing. If a view lacks a value other than its name and pose, the value is taken from the
     object that has the list of views.
@@ -128,8 +129,8 @@ class ViewLayout:
         views: Key of the list of views, "" if the whole file is the list, or a function that lists the views.
         name: Key of the image's name. Views without a name are called "view 0", "view 1" and so on.
         size: Keys of width and height in pixels, or the key of a list [height, width]; "" if the file has no size.
-        unit: Unit of the intrinsics: a pixel, the image's width and height, or the image's larger side. If all
-            intrinsics in "pixels" are small, they are taken as shares of width and height, see
+        unit: Unit of the intrinsics: a pixel, the image's width and height, or the image's larger side. If the unit is
+            "pixels" but all intrinsics are small, they are taken as shares of width and height, see
             :func:`make_camera_file`.
         origin: Point from which the principal point is measured: the upper left corner or the middle of the image.
         lens: Key of the camera model, "" if all views are pinholes. The keys of the coefficients are k1, k2 and so on.

@@ -95,10 +95,10 @@ class ExpectedScores:
     """PSNR (dB) that new views of a scene are expected to have.
 
     Args:
-        before: The PSNR of renders of the input.
-        after: The PSNR of renders of the result.
-        low: Lower bound of the expected gain, which nine of ten results exceed.
-        high: Upper bound of the expected gain, which one of ten results exceeds.
+        before: Expected PSNR of new views rendered from the input.
+        after: Expected PSNR of new views rendered from the result.
+        low: Gain in PSNR that nine of ten results exceed.
+        high: Gain in PSNR that one of ten results exceeds.
     """
 
     before: float
@@ -147,9 +147,9 @@ def color_columns(names: Collection[str] | None) -> tuple[str, ...]:
 def lie_in_unit_range(values: np.ndarray) -> bool:
     """Return whether stored values are opacities or colours in [0, 1], rather than logits or harmonics.
 
-    Rounding and damage may put a few opacities or colours outside of [0, 1]. Logits and harmonics are about as frequent
-    beyond 0 and 1 as near to 0 and 1. Therefore the answer is yes if hardly any value lies outside of [0, 1], and more
-    values lie inside, close to 0 or 1, than outside.
+    Rounding and damage may put a few opacities or colours outside of [0, 1]. Of logits and harmonics, about as many lie
+    just outside of this range as just inside. Therefore the function returns True if hardly any value lies outside of
+    it, and fewer lie outside than just inside.
     """
     excess = np.abs(values[np.isfinite(values)] - 0.5) - 0.5  # distance outside [0, 1]; negative inside
     num_outside = int(np.count_nonzero(excess > 0))
@@ -161,7 +161,7 @@ def lie_in_unit_range(values: np.ndarray) -> bool:
 def are_logarithms(scales: np.ndarray) -> bool:
     """Return whether stored scales are logarithms.
 
-    Logarithms of scales are often negative. Scales that are no logarithms are negative only by damage.
+    Logarithms of scales are often negative, while linear scales are negative only in damaged files.
     """
     return bool(np.count_nonzero(scales < 0) > MAX_STRAY * scales.size)
 
@@ -339,7 +339,8 @@ def to_columns(gaussians: Gaussians, max_degree: int, first_row: int = 0) -> Col
     quats = array(gaussians.quats)
     length = np.linalg.norm(quats, axis=1, keepdims=True)
     quats = np.where(length == 0, (1.0, 0.0, 0.0, 0.0), quats) / np.where(length == 0, 1, length)
-    # Scales of 0 get the least logarithm. Negative scales become NaN, which ``check`` refuses
+    # The logarithm of a scale of 0 is set to the least allowed logarithm. Negative scales become NaN, which ``check``
+    # refuses
     log_scales = np.clip(log(array(gaussians.scales)), -MAX_LOG_SCALE, MAX_LOG_SCALE)
     return Columns(
         means=array(gaussians.means),

@@ -39,8 +39,8 @@ def judge_colors(stored: np.ndarray, plain: np.ndarray | None) -> tuple[ColorUni
     ``plain [n,3]`` are the bytes of the columns red, green and blue if the file has these columns, too. Many harmonics
     are far below zero, since they stand for colours darker than grey. No value of RGB is below black or above white.
     """
-    # RGB of a scene covers more than this part of the range from black to white, while harmonics of a scene with little
-    # contrast cover less
+    # RGB colours of a scene cover more than this part of the range from black to white. Harmonics lie in the range only
+    # in scenes with little contrast, and cover a smaller part
     min_spread = 0.5
     for units in _UNITS if len(stored) >= MIN_JUDGED else ():
         rgb = units.rgb(stored)

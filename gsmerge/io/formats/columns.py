@@ -26,8 +26,8 @@ class ColumnKind:
     remedy: str = ""  # in the error of files with these columns; empty: a note names the columns
 
 
-# A column belongs to the first kind whose pattern matches its name. Columns of floats that belong to no kind are noted
-# as unknown
+# A column belongs to the first entry of this table whose pattern matches the column's name. Columns of floats that
+# match no entry are noted as unknown
 COLUMN_KINDS = (
     ColumnKind(
         "when each Gaussian appears",

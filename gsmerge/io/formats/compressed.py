@@ -94,8 +94,8 @@ def _interpolate(
 ) -> np.ndarray:
     """Interpolate from the minimum to the maximum of each Gaussian's chunk; return values ``[n,3]``.
 
-    ``weights``: three arrays ``[n]`` of weights of the maximum, in [0, 1]. The weights are the result if the file lacks
-    the columns ``ranges``. ``ranges``: names of the three columns with minima, then of those with maxima. ``chunk_ids
+    ``weights``: three arrays ``[n]`` of weights of the maximum, in [0, 1]. If the file lacks the columns ``ranges``,
+    the weights are returned. ``ranges``: names of the three columns with minima, then of those with maxima. ``chunk_ids
     [n]``: the chunk of each Gaussian.
     """
     if all(name in (chunk.dtype.names or ()) and chunk.dtype[name].kind == "f" for name in ranges):

@@ -30,7 +30,7 @@ def read_extra_columns(info: FileInfo) -> np.ndarray:
 
 
 def join_extra_columns(parts: Sequence[np.ndarray]) -> tuple[np.ndarray, list[str]]:
-    """Join the rows of files, in the columns that all files have; also return the names of all other columns."""
+    """Join the rows of files, with only the columns that all files have; also return the names of the other columns."""
     types = [
         {name: part.dtype[name] for name in part.dtype.names or ()} for part in parts
     ]  # of each file: name -> type

@@ -99,7 +99,7 @@ def glb_bytes(
     views, accessors = _describe_arrays(list(attributes.values()))
     for name, bound in (("min", np.min), ("max", np.max)):  # glTF asks for the bounds of positions
         accessors[0][name] = bound(attributes["POSITION"], axis=0).tolist()
-    # An attribute with padded rows is a view of a wider array, which is written with the padding
+    # The array of an attribute may be a view of a wider array with padded rows, which is then written
     content = b"".join((array if array.base is None else array.base).tobytes() for array in attributes.values())
     splats = {"kernel": "ellipse", "colorSpace": COLOR_SPACE}
     splats |= {"sortingMethod": "cameraDistance", "projection": "perspective"}
@@ -130,7 +130,7 @@ def pack_glb(document: dict[str, Any], content: bytes) -> bytes:
 
 
 def _join(blocks: Sequence[np.ndarray]) -> np.ndarray:
-    """Join blocks ``[n,width]`` of rows. If the blocks are views of padded rows, the result is one, too."""
+    """Join blocks ``[n,width]`` of rows. If the blocks are views of padded rows, so is the result."""
     return np.concatenate([block if block.base is None else block.base for block in blocks])[:, : blocks[0].shape[1]]
 
 
@@ -216,7 +216,7 @@ def _damage_errors(path: Path) -> Iterator[None]:
 
 
 class _ForeignError(ValueError):
-    """The content is not supported. The error's text continues "expected a .glb of Gaussians, found"."""
+    """The content is not supported. The message continues the words "expected a .glb of Gaussians, found"."""
 
 
 @dataclass(frozen=True, eq=False)

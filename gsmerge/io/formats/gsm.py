@@ -179,20 +179,20 @@ def read_rows(path: Path) -> StoredRows:
 
 
 def _picture_notes(about: Mapping[str, Any]) -> tuple[str, ...]:
-    """Note if batches have no photos, and which pictures replace the photos."""
+    """Note if batches of views have no photos, and which pictures replace their photos."""
     names = about.get("pictures")
     replacements = sorted({str(name)[:40] for name in names if name != "photos"}) if isinstance(names, list) else []
     return (f"some batches have no photos; {' and '.join(replacements)} replace them",) if replacements else ()
 
 
 def list_batches(path: Path) -> list[dict[str, Any]]:
-    """List the batches in the header of a ``.gsm``, each with its counts and the names of its views in the file."""
+    """List the batches of views in the header of a ``.gsm``, each with its counts and the names of its views."""
     batches = read_header(path)["about"].get("batches")
     return [_describe_batch(batch) for batch in batches if isinstance(batch, dict)] if isinstance(batches, list) else []
 
 
 def _describe_batch(batch: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the counts of a batch, and the names of its views; entries of a wrong type are left out."""
+    """Return the counts of a batch of views, and the views' names; entries of a wrong type are left out."""
     views = batch.get("views")
     counts = {name: batch.get(name) for name in ("num_views", "num_input", "num_new")}
     known: dict[str, Any] = {name: count for name, count in counts.items() if isinstance(count, int)}

@@ -546,7 +546,8 @@ def file_bytes(count: int, sh_degree: int) -> int:
 def count_for_bytes(max_bytes: int, sh_degree: int) -> int:
     """Return the largest number of Gaussians whose ``.ply`` has at most ``max_bytes``; raise UsageError if none fits.
 
-    The size includes the longest comment on new views, even if the result will have no such comment.
+    The size of the ``.ply`` includes the longest header comment on the expected scores of new views, even if the result
+    has no such comment.
     """
     if not 0 <= sh_degree <= MAX_READ_DEGREE:
         raise ValueError(f"sh_degree: expected 0 to {MAX_READ_DEGREE}, got {sh_degree}")

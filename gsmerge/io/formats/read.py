@@ -38,8 +38,8 @@ class FileInfo:
     format: str  # "ascii", "binary little-endian" or "binary big-endian"
     count: int  # number of rows, including unusable ones
     file_bytes: int  # bytes of the file; of levels of detail, also of the chunks of the level that is read
-    # Attribute (means, normals, sh0, shN, opacities, scales, quats, extra) -> its bytes. Ascii files count as if
-    # binary, a .spz before compression, and a .sog by its textures, where opacities are in sh0
+    # Attribute (means, normals, sh0, shN, opacities, scales, quats, extra) -> its bytes. Of an ascii file, the bytes in
+    # binary; of a .spz, before compression; of a .sog, with opacities in sh0
     bytes_by_attribute: dict[str, int]
     columns: tuple[str, ...]  # all columns of the vertex element, in the file's order
     extra_columns: tuple[str, ...]  # the columns that do not belong to Gaussians
@@ -118,7 +118,8 @@ def read_ply(
             as logits. Infinite logits are opacities of 0 and 1.
         scales: How scales are stored. "auto" reads them as logarithms, unless the size of the scene shows that
             they are linear.
-        colors: What ``f_dc_*`` hold. "auto" reads them as harmonics, unless they fill the range of RGB, but no more.
+        colors: What ``f_dc_*`` hold. "auto" reads them as harmonics, unless they fill the range of RGB and hardly any
+            value lies outside of it.
 
     Raises:
         SceneError: If the file cannot be read, lacks columns, or has fewer than 2 finite Gaussians in 1,000 rows.
@@ -274,13 +275,13 @@ def _fill_arrays(paths: Sequence[Path], parts: Sequence[StoredRows], out: dict[s
 def _judge_scales(
     paths: Sequence[Path], parts: Sequence[StoredRows], out: dict[str, np.ndarray], choice: ScaleChoice
 ) -> ScaleJudgement:
-    """Judge whether stored scales are linear or logarithms; ``out`` was filled as for logarithms.
+    """Judge whether stored scales are linear or logarithms; ``out`` has scales that were read as logarithms.
 
-    Only the scales of a PLY file may be linear. Scales in a file of gsmerge are logarithms, unless the caller states
-    something else.
+    Only the scales of a PLY file may be linear. Scales in a file that gsmerge wrote are logarithms, unless the caller
+    states something else.
     """
     judgement = judge_scales(out)
-    # Only the rows of a PLY file are a NumPy array
+    # The rows of a PLY file are a NumPy array, and those of other formats are not
     if not isinstance(parts[0].rows, np.ndarray) or (choice == "auto" and parts[0].encoding is not None):
         return ScaleJudgement(linear=False, why="" if judgement.linear else judgement.why)
     if choice == "linear":
@@ -303,8 +304,9 @@ def _choose_colors(
 ) -> tuple[ColorUnits | None, str, ColorUnits | None]:
     """Choose the units of stored colours: those of RGB, or None for harmonics of degree 0.
 
-    Also return a note if units are guessed, and the units of RGB that the colours have if photos confirm them. Only a
-    PLY file may have RGB. A file of gsmerge has harmonics, unless the caller states something else.
+    Also return a note if the units are guessed. The third result is units of RGB to choose if photos confirm them. Only
+    a PLY file may have RGB. Colours in a file that gsmerge wrote are harmonics, unless the caller states something
+    else.
     """
     names = part.rows.dtype.names or ()
     is_stated = choice == "sh" or (choice == "auto" and part.encoding is not None)
@@ -334,7 +336,7 @@ def _convert_file(path: Path, stored: StoredRows, out: dict[str, np.ndarray]) ->
     with ply.open_rows(path, stored.rows) as read:
 
         def convert(start: int) -> tuple[int, int]:
-            """Convert the block of rows from ``start`` on; return the two numbers for this block."""
+            """Convert the block of rows from ``start`` on; return its numbers of clipped values and of zero quats."""
             block = slice(start, min(start + block_rows, n))
             rows = read(block) if stored.adapt is None else stored.adapt(read(block))
             counts = _convert(rows, {name: array[block] for name, array in out.items()})
@@ -358,8 +360,8 @@ def _convert(rows: np.ndarray, out: dict[str, np.ndarray]) -> tuple[int, int]:
 def _convert_with_kernel(rows: np.ndarray, out: dict[str, np.ndarray]) -> int:
     """Fill arrays with the first rows of a block by the compiled kernel; return how many rows it filled.
 
-    The kernel stops before a row with numbers that are not finite or beyond the limits. The returned number is 0 if a
-    used column is missing or any column is not float32.
+    The kernel stops before a row with numbers that are not finite or beyond the limits. No row is filled if a used
+    column is missing or any column is not float32.
     """
     columns: dict[str, Any] = dict(rows.dtype.fields or {})  # name -> type and offset in bytes
     num_higher = out["shN"].shape[1]
@@ -438,7 +440,7 @@ def _choose_encoding(
 ) -> tuple[str, bool]:
     """Choose the encoding of opacities, "logit" or "raw", and return whether it is a guess.
 
-    A guess ignores the rows ``empty``, which only pad the file.
+    For a guess, the opacities of the rows ``empty``, which only pad the file, are ignored.
     """
     if choice == "raw":
         _check_raw(paths[0], opacities)
@@ -457,10 +459,10 @@ def _choose_encoding(
 
 
 def _declared_encoding(paths: Sequence[Path], parts: Sequence[StoredRows], opacities: np.ndarray) -> str | None:
-    """Return the encoding of opacities that a part declares; None if no part declares one.
+    """Return the encoding of opacities that one of the files declares; None if no file declares an encoding.
 
-    Raise SceneError if parts have different encodings. For this check, the encoding of a part without a declaration is
-    guessed from its values if it has 100 values.
+    Raise SceneError if the files have different encodings. If a file declares no encoding, but has at least 100 values,
+    its encoding is guessed from the values for this check.
     """
     start, part_names = 0, dict[str, str]()  # encoding -> name of the first part that has it
     min_values = 100  # least number of values for a guess
@@ -536,7 +538,8 @@ def find_empty(path: str | Path, out: dict[str, np.ndarray]) -> np.ndarray:
     """Return the valid rows that are no Gaussians, but only pad the file.
 
     A row at the origin pads the file if it is not rotated, round and grey, as a row of zeros is. VolSplat pads with
-    many equal rows at the origin. If all valid rows pad, up to 15 count as Gaussians, and more raise SceneError.
+    many equal rows at the origin. If all valid rows are padding, up to 15 count as Gaussians, and more raise
+    SceneError.
     """
     rows = np.flatnonzero((out["means"][:, 0] == 0) & out["valid"])
     rows = rows[(out["means"][rows] == 0).all(1)]

@@ -15,9 +15,9 @@ from gsmerge.io.formats.write import limit_notes, write_gaussians
 from gsmerge.types import Gaussians, StrPath
 from gsmerge.values.arrays import distinct
 
-# Renders change visibly if the mean square of the Gaussians' moves is above this limit, at which a PSNR of 27 dB drops
-# by .05 dB. A move is divided by the Gaussian's size, and a quotient above 1 counts as 1. In scenes around the origin,
-# the mean square is at most a tenth of this limit.
+# Limit of the mean square of the distances by which rounding moves Gaussians. Above the limit, renders change visibly;
+# at the limit, a PSNR of 27 dB drops by .05 dB. A distance is divided by the Gaussian's size, and a quotient above 1
+# counts as 1. In scenes around the origin, the mean square is at most a tenth of the limit.
 VISIBLE_MEAN_SQUARE = 0.005
 ROUNDING_GAUSSIANS = 1 << 17  # number of Gaussians from which the mean is estimated
 
@@ -28,11 +28,12 @@ def format_notes(path: StrPath, gaussians: Gaussians) -> list[str]:
 
 
 def rounding_notes(path: StrPath, gaussians: Gaussians) -> list[str]:
-    """Note how far the rounding of positions in a format moves Gaussians; empty if renders do not change visibly."""
+    """Note how far a format's rounding of positions moves Gaussians; no notes if renders do not change visibly."""
     if len(gaussians) == 0:
         return []
     format_, columns = output_format(path), gaussians.numpy()
-    # The sample includes the extreme positions, since formats choose the steps of their rounding by the extremes
+    # The sample includes the Gaussians at the least and largest positions, by which formats choose the steps of
+    # rounding
     extremes = columns.means.argmin(axis=0), columns.means.argmax(axis=0)
     rows = distinct(np.concatenate([np.arange(0, len(gaussians), len(gaussians) // ROUNDING_GAUSSIANS + 1), *extremes]))
     means, scales = columns.means.take(rows, axis=0).astype(np.float64), columns.scales.take(rows, axis=0)

@@ -19,7 +19,7 @@ SAMPLES = 20_000  # Gaussians whose scales and colours are judged
 
 @dataclass(frozen=True)
 class ScaleJudgement:
-    """The more likely meaning of stored scales."""
+    """Whether the stored scales of a file are more likely linear or logarithms."""
 
     linear: bool  # False: logarithms
     why: str  # clause that says why scales are linear, or why logarithms seem wrong; "": nothing to say
@@ -28,9 +28,10 @@ class ScaleJudgement:
 def judge_scales(out: dict[str, np.ndarray]) -> ScaleJudgement:
     """Judge whether the scales of a file are linear, from ``scales [n,3]``, ``means [n,3]`` and ``valid [n]``.
 
-    ``scales`` were read as logarithms. The scales are judged linear if the Gaussians are too large for the scene, but
-    would fit the scene with the stored numbers as sizes. In addition, when scales are read as logarithms, either all
-    Gaussians must be about equally large, or half of the Gaussians must be nearly as large as the scene.
+    ``scales`` are the scales that result if the stored numbers are read as logarithms. The scales are judged linear if
+    the Gaussians are too large for the scene, but would fit the scene with the stored numbers as sizes. In addition,
+    with scales as logarithms, either all Gaussians must be about equally large, or half of them must be larger than a
+    quarter of the scene's width.
     """
     valid = out["valid"]
     rows = range(len(valid)) if valid.all() else np.flatnonzero(valid)
@@ -64,9 +65,9 @@ def judge_scales(out: dict[str, np.ndarray]) -> ScaleJudgement:
 def _vary_little_as_logs(stored: np.ndarray) -> bool:
     """Return whether numbers ``stored [s]`` vary much as sizes, but hardly vary if they are logarithms of sizes."""
     low, high = (float(value) for value in quantiles(stored.astype(np.float64), (0.1, 0.9)))
-    # Large sizes are at least 1.5 times the small sizes, so the difference of the logarithms of sizes exceeds 0.4. If
-    # the scales are linear, their difference is much smaller. If the stored sizes are read as logarithms, the resulting
-    # sizes are all close to 1
+    # Large sizes are at least 1.5 times the small sizes, so the logarithms of sizes differ by more than 0.4. Stored
+    # sizes are small numbers, and differ by much less. Read as logarithms, they would stand for sizes that are all
+    # close to 1
     min_variation, min_ratio = 0.4, 4.0
     return low > 0 and float(log(high / low)) > max(min_variation, min_ratio * (high - low))
 

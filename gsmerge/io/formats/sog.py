@@ -205,7 +205,7 @@ def _read_texture(files: _Files, name: str, count: int, budget: ReadBudget) -> n
     width, height = _image_size(data)
     if not count <= width * height <= 4 * count + (1 << 16):
         raise ValueError(f"{name} of {width} x {height} pixels for {count}")
-    # The memory of the image in two orders of channels
+    # The decoded image is in memory twice, in two orders of channels
     budget.check_memory(12 * width * height, f"{name} of {width} x {height} pixels")
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
@@ -408,7 +408,7 @@ def _merge_cells(numbers: np.ndarray, means: np.ndarray) -> np.ndarray:
     previous, following = list(range(-1, len(count) - 1)), list(range(1, len(count) + 1))
 
     def merge_entry(i: int) -> tuple[float, int, int, float, float]:
-        """Return the error that merging cell ``i`` with the next cell adds, both cells, and their counts of values."""
+        """Return the error that merging cell ``i`` and the next cell adds, both cells' indices, and their counts."""
         j = following[i]
         added_error = count[i] * count[j] / (count[i] + count[j]) * (mean[i] - mean[j]) ** 2
         return added_error, i, j, count[i], count[j]

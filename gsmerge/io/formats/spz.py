@@ -167,8 +167,8 @@ def _gzip_parts(budget: ReadBudget, packed: bytes) -> tuple[Header, list[np.ndar
     try:
         header = _read_header(budget, packed, stream.decompress(packed, HEADER.size), (1, 2, 3))
         data = stream.decompress(stream.unconsumed_tail, header.count * sum(header.widths))
-        # This call also checks the checksum. If the stream has ended, the call gets no bytes, since ``unused_data``
-        # would count them twice
+        # This call also compares the checksum. If the stream has ended, b"" is passed, since ``unused_data`` would
+        # count other bytes twice
         extensions = stream.decompress(b"" if stream.eof else stream.unconsumed_tail, _MAX_EXTENSIONS)
     except zlib.error as error:
         raise SceneError(
@@ -216,7 +216,7 @@ def _read_table(path: StrPath, packed: bytes, header: Header, sizes: list[int]) 
     """Return where the table of version 4 starts, and the start of each stream followed by the end of the last one.
 
     Both results are positions in the file, in bytes. ``sizes``: bytes of each unpacked column. Raise SceneError if the
-    table has other sizes, or if the file is too short for the table.
+    table contradicts ``sizes``, or if the file is too short for the table.
     """
     try:
         (table_start,) = TABLE_START.unpack_from(packed, HEADER.size)
@@ -279,8 +279,8 @@ def round_means(means: np.ndarray) -> np.ndarray:
 def choose_fraction(means: np.ndarray, scene_bits: int) -> int:
     """Choose how many bits of quantised means follow the binary point.
 
-    With the chosen number, means near the center of the scene need ``scene_bits`` bits, or fewer if the farthest mean
-    would overflow.
+    Means near the centre of the scene then need ``scene_bits`` bits, or fewer if the farthest mean would overflow
+    otherwise.
     """
     if not len(means):
         return 0
@@ -304,7 +304,7 @@ def spz_columns(
     ``version``: 2 or 3. Raise ValueError if there is NaN or inf.
     """
     means, count, degree = as_array(gaussians.means), len(gaussians), min(max_degree, gaussians.sh_degree)
-    # Means that are not finite raise an error below
+    # The fraction is chosen only if all means are finite, since other means raise an error later
     fraction = choose_fraction(means if np.isfinite(means).all() else means[:0], SCENE_BITS)
     header = Header(version, count, degree, fraction, MIP_FLAG * mip, 0)
     parts = tuple(np.empty((count, width), np.uint8) for width in header.widths)

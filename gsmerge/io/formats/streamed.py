@@ -35,8 +35,8 @@ from gsmerge.values.words import count_words
 
 VERSION = 1  # of the format, as the index states it
 MAX_DEGREE = sog.MAX_DEGREE
-# Thousands of Gaussians in a region of space, for which a viewer chooses one level. A room of a few hundred thousand
-# Gaussians has about twenty regions.
+# A viewer chooses a level of detail for each region of space. The number is how many thousand Gaussians a region has. A
+# room of a few hundred thousand Gaussians has about twenty regions.
 CHUNK_THOUSANDS = 16
 _CHUNK_NAME = re.compile(r"\d+_\d+-[0-9a-f]{8}")  # name of a chunk's folder: level, number, hash
 
@@ -208,7 +208,7 @@ def _walk_runs(tree: dict[str, Any]) -> Iterator[tuple[int, dict[str, Any]]]:
 def _count_by_chunk(chunks: Sequence[Path], runs: Sequence[tuple[int, int, int]]) -> dict[Path, int]:
     """Return the number of Gaussians in each chunk of a level; raise ValueError if its runs overlap or have gaps.
 
-    ``runs``: the index of the chunk, the first row, and the number of rows of each run.
+    ``runs``: for each run of rows, the index of its chunk, its first row and its number of rows.
     """
     counts: dict[Path, int] = {}
     for file, offset, count in sorted(runs):

@@ -42,9 +42,10 @@ class Contents:
     extra_columns: np.ndarray | None = None  # structured array ``[n]``: additional columns of a ``.ply`` with one level
 
 
-# A function that writes the files of an output. Its arguments are the function of :func:`gsmerge.io.atomic_outputs`
-# that adds a temporary file, the path of the output, the temporary file of this path, and the content. The function
-# returns a dictionary: path of each level of detail, finest first -> temporary files of the level.
+# Type of functions that write all files of an output. The arguments are the function from
+# :func:`gsmerge.io.atomic_outputs` that adds a temporary file, the path of the output, the temporary file of this path,
+# and the content. The result is a dictionary: path of each level of detail, finest first -> temporary files of the
+# level.
 WriteOutput = Callable[[AddOutput, Path, Path, Contents], dict[Path, list[Path]]]
 
 
@@ -63,7 +64,7 @@ class Format:
     # Returns the content of one file with Gaussians and comments; None: ``write_ply`` or ``write`` writes the file
     encode: Callable[[Gaussians, Sequence[str]], bytes] | None
     max_degree: int  # largest degree of harmonics that is written; -1: the format is only read
-    # Returns the content of one file if the content also depends on cameras and options; None: ``encode`` returns it
+    # Replaces ``encode`` in formats whose files also depend on cameras and options; None in other formats
     encode_contents: Callable[[Gaussians, Contents], bytes] | None = None
     first_view: bool = False  # True: viewers start at the first camera of a file, which always gets one
     beside: str = ""  # name of a file that is written beside an output; "": none
@@ -75,8 +76,8 @@ class Format:
     finish: Callable[[Path], object] = lambda _: None  # is called with the output's path after all files were renamed
     holds: Callable[[Path], bool] | None = None  # returns whether a file of this name has Gaussians; None: each has
 
-    # How levels of detail are written: "" if only one level can be, "apart" as a file for each, "inside" all in one
-    # output
+    # How levels of detail are written: "apart" for a file per level, "inside" for all levels in one output, "" if the
+    # format allows only one level
     levels: Literal["", "apart", "inside"] = "apart"
     has_cameras: bool = False  # True: the cameras of views are inside the output, not in a file beside it
     round_means: Callable[[np.ndarray], np.ndarray] = to_float32  # rounds positions as a file of the format does
@@ -86,7 +87,7 @@ class Format:
     # Note for the user on harmonics that the format leaves out
     harmonics_note: str = "harmonics above degree {degree}, which {ending} cannot store, are left out"
 
-    # Bytes of a Gaussian with harmonics up to degree 0, 1, 2 and 3; those of packed formats are measured. Empty:
+    # Bytes of a Gaussian with harmonics up to degree 0, 1, 2 and 3; the numbers of packed formats are measured. Empty:
     # budgets in bytes are refused
     gaussian_bytes: Sequence[float] = ()
     other_bytes: Callable[[], int] = lambda: 0  # returns the bytes of an output besides those of its Gaussians

@@ -90,7 +90,7 @@ def most_other_bytes() -> int:
 
 
 def most_bytes(gaussians: Gaussians, cameras: Cameras, comments: Sequence[str]) -> int:
-    """Return the largest number of bytes that a tileset of these Gaussians may have, wherever it is placed."""
+    """Return the largest number of bytes that a tileset of these Gaussians may have, at any place on the globe."""
     return len(_tile_bytes(Contents([gaussians], comments, cameras), np.zeros(3), np.zeros(3))) + REST
 
 

@@ -86,7 +86,7 @@ def write_gaussians(
         gaussians: Gaussians with finite values.
         overwrite: Replace an existing file.
         comments: Lines for the header of a ``.ply``; ``.spz`` and ``.sog`` keep "SplatRenderMode: mip".
-        ending: Ending that chooses the format instead of the ending of the name.
+        ending: Ending of a format, such as ".ply", which replaces the ending of the path in the choice of the format.
         normals: Write the columns of normals to a ``.ply``, as :func:`write_ply` does.
 
     Raises:
