@@ -41,7 +41,7 @@ class ReadBudget:
 
     Args:
         path: The file.
-        file_bytes: Size of the file, with all files that are read together with it.
+        file_bytes: Bytes of the file, plus those of all files that are read together with it.
         memory_per_byte: Bytes of memory that reading may take for each byte of the file, besides 64 MB for any file.
         remedy: Remedy in the error for a file that needs more memory.
     """

@@ -11,7 +11,7 @@ from gsmerge.errors import SceneError
 
 @contextmanager
 def lock_file(path: Path, *, wait: bool = True) -> Iterator[bool]:
-    """Lock a file for the block against other processes, and yield whether this process has the lock.
+    """Lock a file against other processes during a ``with`` block, and yield whether this process has the lock.
 
     If another process has the lock, the call waits until the lock is free, or yields False if ``wait`` is False. Raise
     SceneError if the lock file cannot be made.

@@ -92,10 +92,9 @@ def read_images(source: ImageSource, names: Sequence[str]) -> np.ndarray:
 
 
 def decode_images(paths: Sequence[Path]) -> PhotoArrays:
-    """Decode image files of one size to ``[h,w,3]`` uint8 each. Large images are decoded at each use.
-
-    A file that is several times in ``paths`` is decoded once. Raise SceneError if an image cannot be read, if two
-    images differ in size, or if all images together take more memory than the bytes of their files allow.
+    """Decode image files of one size to ``[h,w,3]`` uint8 each. A file that is several times in ``paths`` is decoded
+    once. If all images together are large, they are decoded at each use instead. Raise SceneError if an image cannot be
+    read, if two images differ in size, or if all images together take more memory than the bytes of their files allow.
     """
     files = list(dict.fromkeys(paths))
     sizes = {path: image_size(path) for path in files}
@@ -120,9 +119,9 @@ def _check_total_memory(paths: Sequence[Path], file_bytes: int, size: Size) -> N
 def decode_photos(paths: Sequence[Path | None], turns: Sequence[int], size: Size, part: Part = WHOLE) -> PhotoArrays:
     """Decode the photo of each view, turn it upright, and resize a ``part`` of it to ``[h,w,3]`` uint8 of one ``size``.
 
-    ``turns`` are those of :func:`orientation_turn`. A view without a file gets a black photo. Large photos are decoded
-    at each use. Other photos are decoded once, even if several views have the same photo. Raise SceneError as in
-    :func:`decode_images`.
+    ``turns`` are those of :func:`orientation_turn`. A view without a file gets a black photo. If all photos together
+    are large, they are decoded at each use. Otherwise each photo is decoded once, even if several views have the same
+    photo. Raise SceneError as in :func:`decode_images`.
     """
     files = list(dict.fromkeys(path for path in paths if path is not None))
     sizes = {path: image_size(path) for path in files}
@@ -236,13 +235,13 @@ def decode_levels(path: Path, photo: Path | None = None) -> np.ndarray:
     """Decode the brightness ``[h,w]`` of a mask, times its opacity, as uint8 with white as 255.
 
     The file may store white as 1, 255 or 65,535. White is taken as the least of 1, 255 and 65,535 that no pixel
-    exceeds. The bytes of the mask and of its ``photo`` together limit the memory, since masks compress to very few
-    bytes.
+    exceeds. Memory is limited by the bytes of the mask's file and of its ``photo`` together, since masks compress to
+    very few bytes.
     """
     budget = _photo_budget(path, *([] if photo is None else [photo]))
 
     def brightness(image: Image.Image) -> np.ndarray:
-        """Return the brightness ``[h,w]`` that the file stores, in images of 8 bits times the opacity."""
+        """Return the brightness ``[h,w]`` that the file stores; in 8-bit images, brightness times opacity."""
         _check_pillow_memory(budget, image)
         if image.mode[0] in "IF":  # more than 8 bits
             return np.asarray(image)
@@ -304,7 +303,7 @@ def _check_pillow_memory(budget: ReadBudget, image: Image.Image) -> None:
 def _decoder_bytes(image: Image.Image) -> float:
     """Return how many bytes per pixel a decoder was measured to need besides the decoded pixels.
 
-    The bytes hold the frames of a WebP, or the coefficients of a progressive JPEG.
+    A decoder of WebP needs this memory for frames, and a decoder of progressive JPEGs for coefficients.
     """
     if image.format == "WEBP":
         return _MOVING_WEBP_BYTES if getattr(image, "is_animated", False) else _WEBP_BYTES

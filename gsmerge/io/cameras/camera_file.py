@@ -309,8 +309,8 @@ def at_own_size(camera_file: CameraFile, size: tuple[int, int] | None) -> Camera
     """Set the size of cameras without a size to twice their principal point, if the photos have another size.
 
     ``size`` is (width, height) of the photos. Cameras stay unchanged if twice the principal point differs from the
-    photos in aspect ratio, or is nearly the photos' size. Sides with a fraction are rounded to multiples of
-    ``PATCH_SIDE``, as the sides of networks' inputs are.
+    photos in aspect ratio, or is nearly the photos' size. Sides that are not whole numbers are rounded to multiples of
+    ``PATCH_SIDE``, since sides of networks' inputs are such multiples.
     """
     if size is None or _stored_sizes(camera_file) != [(0, 0)]:
         return camera_file
@@ -400,10 +400,10 @@ def _share_inside(K: np.ndarray, lens: Lens, size: Size) -> float:
 
 
 def undistort_photos(photos: PhotoArrays, Ks: np.ndarray, lenses: Sequence[Lens | None]) -> PhotoArrays:
-    """Return the photos that pinholes with the same intrinsics would take.
+    """Undistort photos: return the photos that pinholes with the same intrinsics would take.
 
-    Pixels outside of a photo repeat its nearest pixels. ``Ks [c,3,3]`` are for the size of the ``photos``, uint8
-    ``[h,w,3]``, with the top-left pixel's centre at (0.5, 0.5).
+    Pixels that lie outside of the original photo repeat the nearest pixels of its border. ``Ks [c,3,3]`` are for the
+    size of the ``photos``, uint8 ``[h,w,3]``, with the top-left pixel's centre at (0.5, 0.5).
     """
 
     def undistort(view: int, photo: np.ndarray) -> np.ndarray:

@@ -68,7 +68,7 @@ class StoredCameras(NamedTuple):
 
 @contextmanager
 def number_errors(path: Path, expected: str) -> Iterator[None]:
-    """Convert the block's errors about missing keys and wrong values to a SceneError that begins with ``expected``."""
+    """In a ``with`` block, convert errors about keys and numbers to a SceneError that begins with ``expected``."""
     try:
         yield
     except (LookupError, AttributeError, TypeError, ValueError, ArithmeticError) as error:

@@ -17,8 +17,8 @@ _SHARP_ELEMENTS = ("extrinsic", "intrinsic", "image_size")  # SHARP's first vers
 def read_sharp(source: CameraSource) -> StoredCameras | None:
     """Read the camera that SHARP writes into a ``.ply``; None if the ``.ply`` has no such camera.
 
-    The size of the view is that of the grid of Gaussians. The grid is square, because SHARP stretches photos of any
-    shape to a square. Raise SceneError if the numbers of the camera are damaged.
+    The width and height of the view are those of SHARP's grid of Gaussians. The grid is square, because SHARP stretches
+    photos of any shape to a square. Raise SceneError if the numbers of the camera are damaged.
     """
     if find_format(source.path).read is not PLY.read:
         return None

@@ -22,8 +22,7 @@ def is_long_lrm(source: CameraSource) -> bool:
 
 
 def move_to_gaussians(source: CameraSource, views: list[StoredView]) -> list[StoredView]:
-    """Select the views that the model saw, and move them into the Gaussians' world, whose axes are those of the views'
-    mean pose.
+    """Select the views that the model saw, and move them into the Gaussians' world: the frame of the views' mean pose.
 
     ``input_frame_idx.txt``, in the folder of the Gaussians or in that of the cameras, lists the views that the model
     saw. Without this file, all views are returned unchanged. Raise SceneError if the file has wrong numbers, or lists a

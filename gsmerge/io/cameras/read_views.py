@@ -94,7 +94,7 @@ def _check_keys(path: Path, name: str, layout: ViewLayout, entry: Entry) -> None
 
 
 def _camera_values(layout: ViewLayout, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Convert the intrinsics, size and lens in ``values``, which hold one view's values, or values that views share.
+    """Convert the intrinsics, size and lens in ``values``, which are those of one view, or are shared by all views.
 
     The result has the names of ``number_keys``, "K" for a matrix, and "mask". For a lens it also has "model",
     "is_fisheye", "distortion_params" and the coefficients. Names without a value in the file are left out. Errors are

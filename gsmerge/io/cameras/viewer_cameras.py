@@ -82,9 +82,9 @@ def viewer_settings(cameras: Cameras, means: np.ndarray) -> str:
     """Return the text of a ``settings.json``, version 2, which tells SuperSplat's viewer where to look from.
 
     The camera is the first of :func:`order_views`. The target of the camera lies at the median depth of the ``means
-    [n,3]`` in front of the camera. The viewer turns the scene by half a turn about z, and takes the field of view as
-    that of the image's longer side. The settings have a camera track with two keys, both at this camera, because
-    without a track the viewer would move its camera.
+    [n,3]`` in front of the camera. The viewer turns the scene by half a turn about z, and applies the field of view to
+    the longer side of its image. The settings have a camera track with two keys, both at this camera, because the
+    viewer would move its camera if the settings had no track.
     """
     view = order_views(cameras)[0]
     forward, centre = cameras.viewmats[view, 2, :3].astype(np.float64), cameras.centres[view].astype(np.float64)

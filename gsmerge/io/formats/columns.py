@@ -83,7 +83,7 @@ _WHOLE_TYPES = {"i": ("char", "short", "int"), "u": ("uchar", "ushort", "uint")}
 
 
 def _find_kind(name: str) -> ColumnKind | None:
-    """Return the first kind whose pattern matches the name of a column; None for an unknown name."""
+    """Return the first of :data:`COLUMN_KINDS` whose pattern matches a column's name; None for an unknown name."""
     return next((kind for kind in COLUMN_KINDS if re.fullmatch(kind.names, name, re.IGNORECASE)), None)
 
 

@@ -1,11 +1,11 @@
 """Read compressed PLY files of PlayCanvas, SuperSplat and gsplat.
 
-Each Gaussian has four packed words. Each chunk of 256 Gaussians has the least and the largest of the values of its
-Gaussians.
+Each Gaussian has four packed words. Each chunk of 256 Gaussians stores the bounds of their positions and scales, and in
+most files of their colours.
 
-The layout is that of PlayCanvas' reader. Positions and scales have 11, 10 and 11 bits between a chunk's minimum and
-maximum. Rotations are the three smaller components of quaternions at 10 bits. Colours and opacities have 8 bits.
-Harmonics are bytes in the element ``sh``.
+The layout is that of PlayCanvas' reader. The x, y and z of positions and scales have 11, 10 and 11 bits, and range from
+a chunk's minimum to its maximum. Rotations are the three smaller components of quaternions at 10 bits. Colours and
+opacities have 8 bits. Harmonics are bytes in the element ``sh``.
 """
 
 from __future__ import annotations

@@ -164,7 +164,7 @@ def _without_prefix(rows: np.ndarray) -> tuple[np.ndarray, str]:
 
     Columns ``rotation_0`` to ``rotation_3`` get their usual names. Nothing changes if names are usual or would not be
     unique, or if a column has lists. CloudCompare writes "scalar_" before column names that it does not know, and
-    "scalar_scal_" if it writes such a file again.
+    "scalar_scal_" if it writes a file with "scalar_" again.
     """
     names, known_name = tuple(rows.dtype.names or ()), arrays.QUATS[0]
     prefix = next((name.removesuffix(known_name) for name in names if name.endswith(known_name)), "")

@@ -277,8 +277,8 @@ def _judge_scales(
 ) -> ScaleJudgement:
     """Judge whether stored scales are linear or logarithms; ``out`` has scales that were read as logarithms.
 
-    Only the scales of a PLY file may be linear. Scales in a file that gsmerge wrote are logarithms, unless the caller
-    states something else.
+    Only the scales of a PLY file may be linear. Scales in a file of gsmerge are logarithms, unless the caller says
+    otherwise.
     """
     judgement = judge_scales(out)
     # The rows of a PLY file are a NumPy array, and those of other formats are not
@@ -305,8 +305,7 @@ def _choose_colors(
     """Choose the units of stored colours: those of RGB, or None for harmonics of degree 0.
 
     Also return a note if the units are guessed. The third result is units of RGB to choose if photos confirm them. Only
-    a PLY file may have RGB. Colours in a file that gsmerge wrote are harmonics, unless the caller states something
-    else.
+    a PLY file may have RGB. Colours in a file of gsmerge are harmonics, unless the caller says otherwise.
     """
     names = part.rows.dtype.names or ()
     is_stated = choice == "sh" or (choice == "auto" and part.encoding is not None)
@@ -381,7 +380,7 @@ def _convert_with_kernel(rows: np.ndarray, out: dict[str, np.ndarray]) -> int:
 
 
 def _convert_with_numpy(rows: np.ndarray, out: dict[str, np.ndarray]) -> tuple[int, int]:
-    """Fill arrays with rows of any type; return the numbers of rows with clipped values and with zero quats.
+    """Fill arrays with rows of any type; return how many rows have clipped values, and how many have zero quats.
 
     A row is valid if its numbers are finite, except that a logit may be infinite and a scale zero.
     """
@@ -503,7 +502,7 @@ def _check_raw(path: Path, opacities: np.ndarray) -> None:
 
 
 def _spread_low_degree(shN: np.ndarray) -> None:
-    """Mend ``shN [n,15,3]``, in place, if a file of Long-LRM has harmonics of degree 1 or 2.
+    """Put harmonics of degree 1 or 2 from a file of Long-LRM in the right places of ``shN [n,15,3]``, in place.
 
     For degree 1 or 2, Long-LRM fills only the first 9 or 24 of its 45 columns. The filled columns hold all harmonics of
     red, then of green, then of blue.
@@ -563,7 +562,7 @@ def find_empty(path: str | Path, out: dict[str, np.ndarray]) -> np.ndarray:
 def clear_rows(out: dict[str, np.ndarray], rows: np.ndarray) -> None:
     """Make ``rows`` invalid, transparent and grey, in place.
 
-    Each of ``rows`` gets the position and scales of the valid row before it, so that it does not enlarge the scene.
+    Each of these rows gets the position and scales of the valid row before it, so that the scene does not grow.
     """
     if len(rows) == 0:
         return

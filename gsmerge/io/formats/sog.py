@@ -374,16 +374,17 @@ def _encode_webp(image: np.ndarray) -> bytes:
 def fit_codebook(values: np.ndarray) -> np.ndarray:
     """Choose ``[256]`` rising codes that represent finite ``values`` of any shape, by 1-D k-means.
 
-    The values are first divided into thousands of cells. Each step merges the two neighbours with the least added
-    squared error (Ward 1963), until 256 cells are left. Isolated values thus keep their own codes. Lloyd's algorithm
-    then improves the codes. Codes that are not needed repeat the last code.
+    The values are first divided into thousands of cells. Each step merges the two neighbouring cells whose merging adds
+    the least squared error (Ward 1963), until 256 cells are left. Isolated values thus keep their own codes. Lloyd's
+    algorithm then improves the codes. Codes that are not needed repeat the last code.
     """
     ordered = np.sort(values, axis=None)
     distinct = np.unique(ordered)
     if len(distinct) <= CODES:
         return np.pad(distinct, (0, CODES - len(distinct)), "edge" if len(distinct) else "constant")
     sums = np.concatenate([[0], np.cumsum(ordered)])
-    # Cells of equal width keep isolated values apart, and cells with equal counts of values divide dense ranges
+    # Ends of cells of equal width keep isolated values apart, and ends of cells with equal numbers of values divide
+    # dense ranges
     equal_width = np.searchsorted(ordered, np.linspace(ordered[0], ordered[-1], _CELLS))
     equal_count = np.linspace(0, len(ordered), _CELLS).astype(int)
     ends = np.unique([*equal_width, *equal_count])

@@ -1,7 +1,7 @@
 """Read and write levels of detail as Streamed SOG version 1 (developer.playcanvas.com, "The Streamed SOG Format").
 
 The index ``lod-meta.json`` is a tree of boxes. For each level of detail, a leaf names a run, which is a range of rows
-in a chunk. A chunk is an unzipped ``.sog`` in a folder of its own. A viewer loads the visible chunks at the level that
+in a chunk. Each chunk is an unzipped ``.sog`` in a separate folder. A viewer loads the visible chunks at the level that
 suits their distance, and always shows the Gaussians of the ``environment``. The program splat-transform of PlayCanvas
 writes the index and the chunks.
 """

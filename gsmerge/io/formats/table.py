@@ -216,7 +216,7 @@ def estimate_counts(paths: Sequence[Path]) -> tuple[int, int]:
 
 
 def _count_by_size(path: Path) -> tuple[int, int]:
-    """Estimate a file's number of Gaussians by its size, as if of degree 0; also return 0, as columns ``f_rest_*``."""
+    """Estimate a file's number of Gaussians by its size, as if of degree 0; also return 0 columns ``f_rest_*``."""
     try:
         return int(path.stat().st_size / (find_format(path).gaussian_bytes or (math.inf,))[0]), 0
     except OSError:
