@@ -33,6 +33,6 @@ def new_member(name: str) -> zipfile.ZipInfo:
 
 
 def read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:
-    """Read a member, but only the bytes that the archive's directory states; ``ZipFile.read`` might unpack more."""
+    """Read as many bytes of a member as the archive's directory states; ``ZipFile.read`` might unpack more."""
     with archive.open(info) as file:
         return file.read(info.file_size)

@@ -90,7 +90,7 @@ def parse_json(text: str, budget: ReadBudget) -> Any:
 
 @contextmanager
 def read_errors(path: StrPath) -> Iterator[None]:
-    """Convert an OSError or MemoryError of the block to a SceneError that names the file."""
+    """In a ``with`` block, convert an OSError or MemoryError to a SceneError that names the file."""
     try:
         yield
     except OSError as error:

@@ -21,8 +21,8 @@ LOCK = ".gsmerge-lock"  # name of the lock file that is beside a file while a li
 def each_line(path: Path, start: int = 0) -> Iterator[tuple[int, dict[str, Any] | None]]:
     """Yield the position in bytes after each complete line, and the line's JSON object, from byte ``start`` on.
 
-    A damaged line has None as its object. A line whose object takes more memory than the file's budget counts as
-    damaged.
+    For a damaged line, None is yielded as its object. A line whose object takes more memory than the file's budget
+    counts as damaged.
     """
     if not path.exists():
         return

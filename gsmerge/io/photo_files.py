@@ -92,9 +92,11 @@ def read_images(source: ImageSource, names: Sequence[str]) -> np.ndarray:
 
 
 def decode_images(paths: Sequence[Path]) -> PhotoArrays:
-    """Decode image files of one size to ``[h,w,3]`` uint8 each. A file that is several times in ``paths`` is decoded
-    once. If all images together are large, they are decoded at each use instead. Raise SceneError if an image cannot be
-    read, if two images differ in size, or if all images together take more memory than the bytes of their files allow.
+    """Decode image files of one size to ``[h,w,3]`` uint8 each.
+
+    A file that is several times in ``paths`` is decoded once. If all images together are large, they are decoded at
+    each use instead. Raise SceneError if an image cannot be read, if two images differ in size, or if all images
+    together take more memory than the bytes of their files allow.
     """
     files = list(dict.fromkeys(paths))
     sizes = {path: image_size(path) for path in files}

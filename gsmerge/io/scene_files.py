@@ -525,8 +525,8 @@ def _walk_down(folder: Path, *, links: bool) -> list[tuple[Path, list[str] | Non
 def _order_parts(folder: Path, plys: Sequence[Path], cameras: Path | None) -> list[Path] | None:
     """Order files by number if each is a view or a part of one scene; return None if they are several scenes.
 
-    Files belong to one scene if their names say so, or if there are as many cameras as files. If the files hold
-    cameras, they are several scenes, since each file has its own frame. Raise SceneError if a part is missing.
+    Files belong to one scene if their names say so, or if there are as many cameras as files. If a file holds a camera,
+    the files are several scenes, since each file then has a different frame. Raise SceneError if a part is missing.
     """
     matches = [_NUMBERED.fullmatch(path.name) for path in plys]
     stems = {match[1].lower() if match else "" for match in matches}  # names without their numbers

@@ -217,7 +217,7 @@ def _in_pixels(Ks: np.ndarray, sizes: list[tuple[int, int]]) -> tuple[np.ndarray
     """
     is_relative = (Ks[:, 0, 0] < MAX_NORMALISED_FOCAL) & (Ks[:, 1, 1] < MAX_NORMALISED_FOCAL)
     is_relative &= (np.abs(Ks[:, :2, 2] - 0.5) < 1).all(1)
-    # In a picture of a few pixels, a focal length in pixels is as small as a focal length that is divided by the size
+    # If an image has only a few pixels, small focal lengths may be in pixels, too
     if not is_relative.all() or any(0 < min(size) <= MAX_NORMALISED_FOCAL for size in sizes):
         return Ks, sizes
     sizes = [size if min(size) > 0 else (1, 1) for size in sizes]

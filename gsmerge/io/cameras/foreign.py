@@ -36,9 +36,9 @@ _REALITY = "RealityScan or RealityCapture", "export its registration as COLMAP, 
 _OPENMVS = "{}InterfaceCOLMAP of OpenMVS make a COLMAP model of it"
 _ODM = "ODM", "name its opensfm/reconstruction.json"
 _OPENMVG = "OpenMVG", "openMVG_main_openMVG2Colmap makes a COLMAP model of it"
-# Places of cameras in a folder. Cameras in earlier places are preferred. Of several COLMAP models that match a pattern,
-# the model with the most images is preferred. A COLMAP model in the searched folder itself comes last, because Depth
-# Anything 3 writes a model for photos of full size to that place
+# Patterns of the paths of cameras in a folder, the most preferred first. Of several COLMAP models that match one
+# pattern, the model with the most images is preferred. A COLMAP model in the folder itself comes last, because Depth
+# Anything 3 writes there a model for photos of full size
 CAMERA_PLACES = (
     "views.npz", "transforms.json", "transforms_train.json", "transforms_test.json", "transforms_val.json",
     "cameras.json", "camera_params.json", "sparse/*", "sparse", "colmap/sparse/*", "colmap",

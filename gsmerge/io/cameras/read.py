@@ -108,8 +108,8 @@ def read_cameras(path: StrPath, *, folder: Path | None = None) -> CameraFile:
 def _resolve(path: Path) -> Path:
     """Return the camera file to which a path leads, or the folder of the cameras if they are in several files.
 
-    A folder leads to the camera file in it. A file of a COLMAP model or of Polycam's keyframes leads to its folder.
-    Raise SceneError if there are no cameras.
+    For a folder, return the camera file in it. For a file of a COLMAP model or of Polycam's keyframes, return its
+    folder. Raise SceneError if there are no cameras.
     """
     if not os.path.exists(path):
         raise SceneError(path, "no such file or folder")

@@ -1,6 +1,7 @@
 """Classes that declare how a file stores its views, by the keys of their poses, intrinsics, sizes and lenses.
 
-The table of camera formats holds one :class:`ViewLayout` per format, by which ``read_views.py`` reads files.
+An entry in the table of camera formats may have a :class:`ViewLayout`, by which ``read_views.py`` reads files of the
+format.
 """
 
 from __future__ import annotations

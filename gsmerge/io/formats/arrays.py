@@ -215,7 +215,7 @@ def concatenate(parts: Sequence[Columns], num_higher: int) -> Columns:
 class Packed:
     """The ``count`` Gaussians of a file with packed columns; the thread-safe ``unpack`` returns a block of Gaussians.
 
-    Gaussians are unpacked in blocks, since all unpacked Gaussians together take several times the memory of the result.
+    Gaussians are unpacked in blocks to save memory.
     """
 
     count: int
@@ -303,14 +303,14 @@ def to_stored(parts: Sequence[Packed], format_name: str, sizes: dict[str, int], 
 def max_array_bytes(file_bytes: int) -> int:
     """Return the size in bytes from which an array of Gaussians lies in a temporary file instead of memory.
 
-    Unpacked harmonics may be many times as large as the file that is read.
+    The harmonics that are unpacked from a file may be many times as large as the file.
     """
     return max(1 << 25, 8 * file_bytes)
 
 
 def check_gaussian_count(budget: ReadBudget, count: int, num_higher: int, packed_bytes: int) -> None:
     """Raise SceneError if ``count`` Gaussians, with ``packed_bytes`` each, take more memory than ``budget`` allows."""
-    # Larger harmonics lie in a temporary file
+    # Harmonics above this number of bytes lie in a temporary file instead of memory
     harmonics_bytes = min(12 * num_higher * count, max_array_bytes(budget.file_bytes))
     unpacked_bytes = 16_000_000  # bytes of all blocks that are unpacked at the same time
     num_bytes = count * (packed_bytes + GAUSSIAN_BYTES) + harmonics_bytes + unpacked_bytes

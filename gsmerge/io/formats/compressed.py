@@ -1,7 +1,7 @@
 """Read compressed PLY files of PlayCanvas, SuperSplat and gsplat.
 
-Each Gaussian has four packed words. Each chunk of 256 Gaussians stores the bounds of their positions and scales, and in
-most files of their colours.
+Each Gaussian has four packed words. Each chunk of 256 Gaussians stores the bounds of their positions and scales, and
+may store those of their colours.
 
 The layout is that of PlayCanvas' reader. The x, y and z of positions and scales have 11, 10 and 11 bits, and range from
 a chunk's minimum to its maximum. Rotations are the three smaller components of quaternions at 10 bits. Colours and

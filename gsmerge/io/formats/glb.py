@@ -53,7 +53,7 @@ READ_EXTENSIONS = {NAME, COMPRESSED, "KHR_mesh_quantization", "KHR_materials_unl
 _FLOAT, _BYTE, _VERTICES, _POINTS = 5126, 5121, 34962, 0
 _TYPE_NAMES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}  # width of a value -> its type in glTF
 _WIDTHS = {name: width for width, name in _TYPE_NAMES.items()}
-# NumPy's name of a type -> glTF's number of the type; then the number -> NumPy's name
+# NumPy's name of a type -> glTF's number of the type. The second dictionary has glTF's number -> NumPy's name
 _COMPONENTS = {"<f4": _FLOAT, "|u1": _BYTE, "<i2": 5122, "<u2": 5123}
 _DTYPES = {5120: "<i1", _BYTE: "<u1", 5122: "<i2", 5123: "<u2", _FLOAT: "<f4"}
 # A file begins with a mark, the version and the file's length. A chunk begins with its length and its kind
@@ -64,7 +64,7 @@ _MOVING_KEYS = {"matrix", "rotation", "scale", "translation"}  # keys of a node 
 
 
 def encode_contents(gaussians: Gaussians, contents: Contents) -> bytes:
-    """Encode a ``.glb`` file as :func:`glb_bytes` does, with a camera node for each view of the contents.
+    """Encode a ``.glb`` file as :func:`glb_bytes` does, with a camera node for each view in ``contents``.
 
     The view nearest to the middle of all views is the first camera, since viewers look from the first camera.
     """
@@ -206,7 +206,7 @@ def read_rows(path: Path) -> StoredRows:
 
 @contextmanager
 def _damage_errors(path: Path) -> Iterator[None]:
-    """Convert errors of the block that a damaged or unsupported file causes to a SceneError."""
+    """In a ``with`` block, convert errors that a damaged or unsupported file causes to a SceneError."""
     try:
         with read_errors(path):
             yield

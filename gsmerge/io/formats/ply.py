@@ -313,8 +313,8 @@ class _BinaryRows(BufferedReader):
 def open_rows(path: Path, rows: np.ndarray | arrays.PackedRows) -> Iterator[Callable[[slice], np.ndarray]]:
     """Yield a thread-safe function that returns blocks of a PLY file's rows.
 
-    Mapped rows are read from the file, not from the mapped memory. If another program shortened the file, access to the
-    mapped memory would end the process, while reading from the file raises SceneError.
+    Rows of a memory map are read from the file instead. If another program shortened the file, access to the map would
+    end the process, while reading from the file raises SceneError.
     """
     if not isinstance(rows, np.memmap):
         yield rows.__getitem__

@@ -28,9 +28,9 @@ class ScaleJudgement:
 def judge_scales(out: dict[str, np.ndarray]) -> ScaleJudgement:
     """Judge whether the scales of a file are linear, from ``scales [n,3]``, ``means [n,3]`` and ``valid [n]``.
 
-    ``scales`` are the scales that result if the stored numbers are read as logarithms. The scales are judged linear if
-    the Gaussians are too large for the scene, but would fit the scene with the stored numbers as sizes. In addition,
-    with scales as logarithms, either all Gaussians must be about equally large, or half of them must be larger than a
+    ``scales`` are the scales that result if the stored numbers are read as logarithms. The stored numbers are judged
+    linear if, as logarithms, they give Gaussians too large for the scene, but as sizes fit the scene. In addition, with
+    scales as logarithms, either all Gaussians must be about equally large, or half of them must be larger than a
     quarter of the scene's width.
     """
     valid = out["valid"]

@@ -152,7 +152,7 @@ def is_sog_meta(path: Path) -> bool:
 
 @contextmanager
 def _damage_errors(path: Path) -> Iterator[None]:
-    """Convert errors of the block that a damaged file causes to a SceneError."""
+    """In a ``with`` block, convert errors that a damaged file causes to a SceneError."""
     try:
         with read_errors(path):
             yield

@@ -77,8 +77,8 @@ def write_levels(
 def write_output(add: AddOutput, path: Path, index: Path, contents: Contents) -> dict[Path, list[Path]]:
     """Write the files of a Streamed SOG.
 
-    ``add`` makes the temporary file of a path; ``index`` is that of ``path``. Return the path of each level, with its
-    temporary files. The path of a coarser level is the ``meta.json`` of its first chunk.
+    ``add`` makes the temporary file of a path; ``index`` is the temporary file of ``path``. Return the path of each
+    level, with its temporary files. The path of a coarser level is the ``meta.json`` of its first chunk.
     """
     with TemporaryDirectory(prefix="gsmerge-") as folder:
         arguments: list[object] = []
@@ -181,7 +181,7 @@ def _list_levels(path: Path, document: dict[str, Any]) -> tuple[dict[Path, int],
 
 
 def _chunk_path(index: Path, name: Any) -> Path:
-    """Return the path of the chunk ``name`` of an index; raise ValueError if this is outside the index's folder."""
+    """Return the path of the chunk ``name`` of an index; raise ValueError for a path outside of the index's folder."""
     chunk = PurePosixPath(str(name))
     is_outside = chunk.is_absolute() or ".." in chunk.parts or "\\" in str(name) or "\0" in str(name)
     if is_outside or chunk.name != sog.META:
@@ -223,7 +223,7 @@ def read_rows(path: Path, level: int = 0, index: StreamedIndex | None = None) ->
     """Read the Gaussians of one level; level 0, the finest, includes the environment.
 
     ``index``: result of :func:`read_index` for the path; None: read the index. Raise SceneError if the index or a chunk
-    cannot be read, or if a chunk contradicts the index.
+    cannot be read, or if the two state different numbers of Gaussians.
     """
     index = index or read_index(path)
     chunks: dict[Path, int | None] = {**index.levels[level]}
@@ -248,7 +248,7 @@ def read_level(path: Path, level: int, index: StreamedIndex | None = None) -> Ga
 
 
 def _read_chunks(path: Path, chunks: Mapping[Path, int | None]) -> list[sog.SogContent]:
-    """Read chunks; raise SceneError if the chunks take more memory than one file of as many bytes may take.
+    """Read chunks; raise SceneError if together they take more memory than is allowed for one file of as many bytes.
 
     ``chunks``: path of each chunk -> the number of Gaussians that the index states for it, or None.
     """

@@ -36,8 +36,8 @@ _Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  #
 def write_output(add: AddOutput, path: Path, index: Path, contents: Contents) -> dict[Path, list[Path]]:
     """Write the files of a tileset.
 
-    ``add`` makes the temporary file of a path; ``index`` is that of ``path``. Return ``path``, with a list of all
-    temporary files.
+    ``add`` makes the temporary file of a path; ``index`` is the temporary file of ``path``. Return ``path``, with a
+    list of all temporary files.
     """
     tile = path.with_name(TILESET.beside)
     # The bounds are percentiles of the means, since bounds with a few far Gaussians would make the scene look small
@@ -49,7 +49,7 @@ def write_output(add: AddOutput, path: Path, index: Path, contents: Contents) ->
     box = [*matmul(to_z_up, (low + high)[:, None] / 2)[:, 0].tolist(), *half_edges.reshape(-1).tolist()]
     place = contents.options.place
     root = {"boundingVolume": {"box": box}, "geometricError": 0, "refine": "REPLACE", "content": {"uri": tile.name}}
-    # After half a turn, z points north
+    # Half a turn is applied first, so that the z axis of the ``.spz`` points north
     to_globe = matmul(np.eye(4) if place is None else globe_matrix(place), HALF_TURN)
     root["transform"] = to_globe.T.reshape(-1).tolist()
     extensions = {"extensionsUsed": [NAME, COMPRESSED], "extensionsRequired": [NAME, COMPRESSED]}
