@@ -352,8 +352,7 @@ def _search_roots(path: Path, ply: Path, within: StrPath | None) -> tuple[list[P
     own = [Path(os.path.realpath(given_folder)), folder, *program_folders]
     own += _list_between(folder, Path(os.path.realpath(path)))
     above = _list_between(folder, Path(os.path.realpath(within or folder)))
-    # A folder with a scene of a usual name is not searched for other scenes, since its photos and cameras belong to
-    # that scene
+    # A folder above is left out if it has a scene with a usual name, since its photos and cameras belong to that scene
     shared = [Path(os.path.realpath(ply)).parent, *(place for place in above if named_ply(place) is None)]
     return list(dict.fromkeys(own)), [place for place in dict.fromkeys(shared) if place not in own]
 

@@ -50,8 +50,8 @@ def read_da3(source: CameraSource) -> StoredCameras:
     Poses are 3x4 or 4x4, world to camera. Intrinsics that are divided by the image size, or are for another image size,
     are scaled to pixels of the images or depth maps in the file. Depth Anything 3 stores intrinsics for another image
     size if it exports a COLMAP model in the same call. Files of Lyra 2 (``cameras.npz``), VGGT and AnySplat are also
-    read. Poses of AnySplat are camera to world, its intrinsics are divided by the size, and its arrays are a batch of
-    one. Raise SceneError if the file cannot be read or lacks an array.
+    read. AnySplat writes poses as camera to world, intrinsics divided by the image size, and arrays as a batch of one.
+    Raise SceneError if the file cannot be read or lacks an array.
     """
     path = source.path
     size_names = () if holds_images(path) else _DEPTHS  # without images, the shape of depth maps gives the size
