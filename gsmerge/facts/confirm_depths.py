@@ -1,10 +1,9 @@
 """Scene with pixels -> the share of its depth that other views confirm, which predicts whether a fit can succeed.
 
-Each pixel's Gaussian is projected into the other views. The Gaussian that another view shows in front at this place is
-projected back into the first view. If this Gaussian lands near the pixel, at about the same depth, the other view
-confirms the pixel. A pixel is contradicted if more views see through its surface than confirm it, and alone if its
-position is outside of all other views. A pixel does not count if other views have no Gaussian at its position, for
-example beyond a crop.
+Each pixel's Gaussian is projected into the other views. The Gaussian in front there is projected back into the first
+view. If it lands near the pixel, at about the same depth, the other view confirms the pixel. A pixel is contradicted if
+more views see through its surface than confirm it, and alone if its position is outside of all other views. A pixel
+does not count if other views have no Gaussian at its position, for example beyond a crop.
 """
 
 from __future__ import annotations
@@ -30,13 +29,13 @@ AGREEMENT_SHARE, AGREEMENT_PIXELS = 1 / 120, 1.5
 SAME_LOG_DEPTH = 0.05  # difference of the logarithms of two depths of one surface
 LEAST_DEPTH = 1e-9  # least depth, canonical units
 # A result is expected to be poor if the share of confirmed pixels is below POOR_SHARE. POOR_SHARE separates the poor
-# results of 15 captures from the sound results. If the share of alone pixels is above LONELY_SHARE, a poor result is
-# blamed on too few views
+# results of 15 captures from the sound results. If the share of pixels that no other view sees is above LONELY_SHARE, a
+# poor result is blamed on too few views
 POOR_SHARE, LONELY_SHARE = 0.5, 0.2
 # Chance may change a share by CHANCE_ERRORS standard errors. Fewer samples than NORMAL_SAMPLES decide nothing
 CHANCE_ERRORS, NORMAL_SAMPLES = 2.0, 30
-# Parts of pictures, as ranges of columns and of rows in thirds. A part is poor if more than the share POOR_PART_SHARE
-# of its pixels is contradicted, or alone
+# Parts of pictures, as ranges of columns and of rows in thirds. A part is poor if the share of its pixels that other
+# views contradict, or the share that no other view sees, is above POOR_PART_SHARE
 THIRDS = {
     "left third": ((0, 1), (0, 3)), "right third": ((2, 3), (0, 3)), "upper third": ((0, 3), (0, 1)),
     "lower third": ((0, 3), (2, 3)), "middle": ((1, 2), (1, 2)),
@@ -59,7 +58,7 @@ class Agreement:
     num_pixels: int = field(default=CONFIRM_PIXELS, compare=False)  # Number of sampled pixels that count
     # Part of the pictures in which most pixels are contradicted, such as "left third of 4 of 7 views"; empty for none
     contradicted_part: str = field(default="", compare=False)
-    alone_part: str = field(default="", compare=False)  # Part in which most pixels are alone
+    alone_part: str = field(default="", compare=False)  # Part whose pixels other views mostly do not see
     # True if the cameras are so close together that no two views show things displaced by ``AGREEMENT_PIXELS``
     from_one_point: bool = field(default=False, compare=False)
 
@@ -96,8 +95,8 @@ class Agreement:
 def confirm_depths(scene: Scene) -> Agreement | None:
     """Measure the shares of depth that the views of a scene confirm, contradict, or do not see.
 
-    Returns None with fewer than two views, or if no pixel counts. Returns None also if views have no Gaussians of their
-    own, because a Gaussian that several views share would confirm itself.
+    Returns None with fewer than two views, or if no pixel counts. Returns None also if views share Gaussians, because a
+    shared Gaussian would confirm itself.
     """
     pixels = scene.pixels
     if len(scene) < 2 or pixels is None or not pixels.own or not pixels.shown.any():

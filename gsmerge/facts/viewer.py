@@ -22,8 +22,8 @@ ALIKE = 0.5  # the spread of the logarithms of angles, divided by that of the lo
 # sides of it have equal errors. Of the likely places, the one with Gaussians in most directions is the viewer's
 LIKELY = 1.1
 CELLS = 100  # cells of directions, half of which the scene has to cover
-# The share NEAR_SHARE of the Gaussians is nearer to a viewer than some distance, of which the radius of the empty space
-# around the viewer is the share FREE
+# The radius of the empty space around a viewer is FREE times the distance within which the share NEAR_SHARE of the
+# Gaussians lies
 FREE, NEAR_SHARE = 0.25, 0.05
 
 
@@ -37,7 +37,7 @@ class Viewer:
 
 
 def find_viewer(gaussians: Gaussians) -> Viewer | None:
-    """Find the viewer around whom finite Gaussians were made.
+    """Find the place of the viewer for whom finite Gaussians were made, from their sizes.
 
     Returns None if sizes do not grow with the distance from any place, or if too many directions show nothing.
     """

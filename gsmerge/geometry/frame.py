@@ -19,7 +19,7 @@ from gsmerge.types import Cameras, Gaussians, Scene, SceneT
 
 FRAME_GAUSSIANS = 65536  # Gaussians by which the frame is chosen
 FRAME_ROWS = 65536  # Gaussians per task
-MAX_UNIT_VIEWS = 32  # most views by which the unit is chosen, if views have no Gaussians of their own
+MAX_UNIT_VIEWS = 32  # most views by which the unit is chosen, if views share Gaussians
 
 
 @dataclass(frozen=True, eq=False)

@@ -284,7 +284,7 @@ def order_others(distances: np.ndarray) -> np.ndarray:
 def median(values: np.ndarray) -> float:
     """Return the median of all ``values``; NaN if there are no values, or if a value is NaN.
 
-    ``np.median`` is several times as slow.
+    The function is several times as fast as ``np.median``.
     """
     values = values.reshape(-1)
     if len(values) > FEW_VALUES and not np.isnan(values.min()):

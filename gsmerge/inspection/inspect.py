@@ -224,8 +224,8 @@ def _describe_sight(scene: Scene) -> dict[str, Any]:
 def _count_unseen(load: Loaded) -> dict[str, Any]:
     """Count the Gaussians of a result that no view shows; {} if this number would mean nothing.
 
-    The number means nothing without views. It also means nothing if there is a Gaussian for each pixel, because
-    Gaussians of overlapping views hide each other.
+    The number means nothing without views, or if each pixel has a Gaussian, because Gaussians of overlapping views hide
+    each other.
     """
     if len(load.scene) == 0 or load.recovery is not None:
         return {}

@@ -295,8 +295,8 @@ def assign_photos(
         show: ``show(side)`` makes pictures of the views with ``side`` pixels on the longer side.
         candidates: The photos.
         named: The photo that names or order propose for each view, or None.
-        exact: The proposal is by names. If most names prove right, a view without a photo of its name gets no photo,
-            because all photos have names of other views.
+        exact: The proposal is by names. If most names prove right, a view gets no photo if no photo has its name,
+            because all photos have the names of other views.
         stored: The photos as stored in their files, if ``candidates`` are resampled to the views.
 
     Returns:

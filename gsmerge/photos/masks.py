@@ -37,7 +37,7 @@ _WHITE = np.uint8(255)
 
 
 class CameraMaskError(SceneError):
-    """Raised if pictures that the cameras' file names as masks are photos."""
+    """Raised if the camera file lists photos as masks."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,8 +120,8 @@ def read_masks(
 ) -> tuple[Masks, list[str]]:
     """Read the masks of a scene's photos; return them and notes.
 
-    Masks that the cameras' file names are used, or if it names none, masks beside the scene. ``stored`` and ``cut`` are
-    fields of :class:`MaskFiles`. SceneError if masks are photos.
+    The masks that the camera file lists are used, or if it lists none, masks beside the scene. ``stored`` and ``cut``
+    are fields of :class:`MaskFiles`. SceneError if masks are photos.
     """
     paths = photos.paths
     views = [view for view in range(len(camera_file)) if not paths or paths[view] is not None]  # with a photo

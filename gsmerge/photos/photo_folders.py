@@ -54,7 +54,7 @@ def find_named_photos(
     file_names = {PurePath(name).name for name in camera_file.names}
 
     def rank(folder: Path) -> tuple[Any, ...]:
-        """Return a key by which better folders sort first: minus the number of cameras with a photo, then the rest."""
+        """Return a key that sorts better folders first: minus the number of cameras with a photo, then the criteria."""
         proposed = propose_images(folder, list(pools[folder]), camera_file.names, count_pixels)
         first = next(filter(count_pixels, filter(None, proposed)), None)
         if first is None:

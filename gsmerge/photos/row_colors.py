@@ -1,9 +1,9 @@
-"""Scene without photos -> the scene with the colours of its rows as photos; each view needs Gaussians of its own.
+"""Scene without photos -> the scene with the colours of its rows as photos, if each Gaussian belongs to one view.
 
 Feed-forward models take the colour of a pixel's Gaussian from the photo. The Gaussians' colours are compared with a
-drawing of the view's own Gaussians from its own camera, after both are blurred. A solid drawing replaces the colours if
-they differ from the drawing, and if the Gaussians of a pixel are so faint that their colours mean little. Pixels with
-neither a colour nor a solid drawing do not count.
+drawing of the view's own Gaussians from its own camera, after both are blurred. A pixel shows an opaque drawing instead
+of its Gaussians' colour if both differ, or if its Gaussians are so faint that their colours mean little. Pixels with
+neither a colour nor an opaque drawing do not count.
 """
 
 from __future__ import annotations

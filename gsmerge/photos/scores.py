@@ -110,7 +110,7 @@ class Comparer:
 def _make_filters(small: ViewPictures, quarters: Sequence[int]) -> _Filters:
     """Make filters for photos that are stored turned by any of the numbers ``quarters`` of quarter turns.
 
-    For each view and each number of turns there is a filter, and one more for the mirrored photo.
+    Each view has two filters for each number of quarter turns, one of them for the mirrored photo.
     """
     orientations = tuple(quarter + mirrored for mirrored in (0, ORIENTATIONS // 2) for quarter in quarters)
     products, weights, lengths = [], [], []

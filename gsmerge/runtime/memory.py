@@ -106,7 +106,7 @@ def memory_problem(needed: int, remedy: str = FEWER_PIXELS) -> str | None:
 def keep_memory() -> None:
     """Let new arrays reuse the memory of deleted arrays, if the C library can.
 
-    Only processes that do a single job call this function, after which a process keeps more memory than it uses.
+    The process then keeps more memory than it uses, so only processes that do a single job call this function.
     """
     with suppress(AttributeError, OSError, TypeError):  # not glibc
         mallopt = ctypes.CDLL(None).mallopt

@@ -264,8 +264,8 @@ def _read_or_error(read: Callable[[], T]) -> T | SceneError:
 def _note_left_out(load: Loaded, files: SceneFiles, left_out: list[str], cause: SceneError) -> Loaded:
     """Return a scene with a doubt which says what is left out, why, and what the user can do.
 
-    ``left_out`` describes these files in words. If photos are not used without these files, the doubt also names the
-    photos, and replaces the notes on photos.
+    ``left_out`` describes the files that are left out. If photos cannot be used without these files, the doubt also
+    names the photos, and replaces the notes on photos.
     """
     photos = f"the photos in {files.images or files.ply.parent}"
     photo_notes = tuple(text for text in load.notes if text.startswith(f"{photos} are not used"))
@@ -297,9 +297,9 @@ def _add_photos(
 ) -> Loaded | SceneError:
     """Combine Gaussians and cameras with their photos; return the error if the cameras do not see the Gaussians.
 
-    Photos are files of their own, or all photos are inside one file. Photos that the caller did not name are left out,
-    with a note, if they cannot be read or do not show the views; see :func:`_leave_out_photos`. If ``photos`` is False,
-    all photos are left out.
+    Each photo is a separate file, or one file has all photos. Photos that the caller did not name are left out, with a
+    note, if they cannot be read or do not show the views; see :func:`_leave_out_photos`. If ``photos`` is False, all
+    photos are left out.
     """
     proposal = _read_or_error(partial(propose_photos, files, camera_file)) if photos else None
     if isinstance(proposal, Proposal) and proposal.by_names:
@@ -347,7 +347,7 @@ def _assign_photos(make_scene: MakeScene, camera_file: CameraFile, proposal: Pro
     1. If the photos have another shape than the cameras, parts of the photos are used if they show the views.
     2. The scene is read with the proposed photos, or if these photos cannot be used, without photos.
     3. The views of this scene decide which photo belongs to a view. Parts of photos are used if the parts fit better.
-    4. The scene is read again if other photos belong to the views than were proposed.
+    4. If the views show photos other than the proposed ones, the scene is read again.
 
     Notes name photos that cannot be read, and views without a photo. Returns an error if no photo shows a view.
     """
@@ -417,8 +417,8 @@ def _leave_out_photos(
 
     ``cause`` says why photos and cameras do not fit each other. Photos that the caller named are never left out. Other
     photos are left out if it is certain that the cameras belong to the scene: if rows are pixels of the cameras, if the
-    cause is a photo, or if the photos were found by the cameras' names. That cameras see the Gaussians is no proof,
-    because cameras of another scene may see them, too.
+    cause is a photo, or if the photos were found by the cameras' names. Cameras that merely see the Gaussians may still
+    belong to another scene.
     """
     are_named = "images" in files.named
     if are_named and "cameras" not in files.named and cause.path == camera_file.path:
