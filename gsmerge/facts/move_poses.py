@@ -80,10 +80,10 @@ class _PhotoLevel:
 
 @dataclass(frozen=True, eq=False)
 class _Evidence:
-    """Evidence from the pixels of the first view of each of p pairs about the relative pose of both views."""
+    """Evidence about the relative poses of p pairs of views, from the pixels of each pair's first view."""
 
-    # Curvature and slope of half the squared differences of greys, by a motion of the second view. The same motion of
-    # the first view changes the differences the other way, because only the relative pose counts
+    # Curvature and slope of half the squared differences of greys, by a motion of the second view. Only the relative
+    # pose counts, so the same motion of the first view changes the differences the other way
     curvatures: np.ndarray  # [p,6,6]
     slopes: np.ndarray  # [p,6]
     costs: np.ndarray  # [p] mean disagreement of the pixels
@@ -196,8 +196,8 @@ def _expect_greys(
     """Return the greys ``[p,m]`` that the second view of each pair should show at the sampled points of the first.
 
     The expected greys are the ``greys`` of the first view, plus the change of colour of the Gaussians ``rows`` from the
-    first view to the second. Without this change a highlight, which moves over its surface with the camera, would look
-    like a wrong pose.
+    first view to the second. Without this change, a highlight would look like a wrong pose, because it moves over its
+    surface with the camera.
     """
     g, eyes = scene.gaussians, scene.cameras.centres.astype(np.float32)
     expected = np.zeros((len(pairs), max(map(len, greys))), np.float32)

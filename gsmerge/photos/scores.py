@@ -2,8 +2,8 @@
 
 A photo and a view are a wrong pair if the photo does not show the view. The similarity of a photo and a picture is the
 correlation of their local contrast at two sizes. Exposure, white balance and soft colours hardly change this
-correlation. Correlations are converted to Fisher's z, whose noise does not depend on its value. Nearly all pairs of a
-scene are wrong, so the median absolute deviation of all z is the noise of wrong pairs.
+correlation. Correlations are converted to Fisher's z, whose noise does not depend on its value. Nearly all pairs of
+photos and views are wrong, so the median absolute deviation of all z is the noise of wrong pairs.
 """
 
 from __future__ import annotations

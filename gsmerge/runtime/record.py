@@ -24,7 +24,7 @@ STAGES = (
 )  # fmt: skip
 FIT_STEP = "fit: "  # texts that report steps of a fit begin with this text
 BEFORE_FIT = 0.8  # share of the seconds of stages without fits that pass before the fits
-# Memory is released after these stages, whose threads have freed much memory that other threads cannot use
+# After these stages memory is released, because their threads have freed much memory that other threads cannot use
 RELEASED = ("prepare", "segment", "encode", "match", "refine", "fit")
 
 

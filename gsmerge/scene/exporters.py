@@ -46,7 +46,7 @@ class Model:
 
 @dataclass(frozen=True)
 class Exporter:
-    """Code that saves Gaussians, shared by some models, and the properties by which its files are recognised."""
+    """Code of one or more models that saves Gaussians, and the properties by which its files are recognised."""
 
     name: str  # on the command line
     models: tuple[Model, ...]  # the models that use it
@@ -393,8 +393,8 @@ def choose_exporters(name: str, info: FileInfo, order: str, cameras: str) -> tup
     """Return the exporter with a name; for "auto", all exporters that may have written the file.
 
     An exporter may have written the file if it writes the file's columns, the format of its ``cameras`` ("" without
-    cameras), and its ``order`` of rows ("none" if rows have no pixels). If the file has a mark of exporters, only
-    exporters with this mark are returned, even if none of them writes rows in the order ``order``.
+    cameras), and its ``order`` of rows ("none" if rows have no pixels). If exporters that leave a mark in their files
+    match, only they are returned, even if none of them writes rows in the order ``order``.
     """
     exporter = find_exporter(name)
     if exporter is not None:

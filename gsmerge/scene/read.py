@@ -89,7 +89,7 @@ def read_scene(
         images: Folder of images, an ``.npz`` that holds images, or "none". If None, images are searched as cameras are.
         masks: Folder of images with the names of the photos, dark where a photo does not count, or "none". If None, the
             masks that ``transforms.json`` names are used, or the folder ``masks`` beside the photos, and the photos'
-            transparency. Lighter greys are weights in a fit.
+            transparency. Greys between dark and white weigh a pixel in a fit.
         protect: Folder of images with the names of the photos, white where a text or a face has to stay sharp; see
             :attr:`Scene.importance`.
         opacity: How opacities are stored; see :func:`gsmerge.io.read_gaussians`.
@@ -203,9 +203,9 @@ def _read_without_cameras(
 ) -> Loaded | SceneError:
     """Read a scene without its camera file, with a note; cameras are estimated from the rows instead.
 
-    ``result`` is what reading with the camera file gave: a scene with fewer views than the rows form, or an error.
-    ``result`` is returned if the scene cannot be read without the camera file, or if photos that the caller named would
-    not be used without it.
+    ``result`` is the result of reading with the camera file: a scene with fewer views than the rows form, or an error.
+    ``result`` is returned if the scene cannot be read without the camera file, or only without photos that the caller
+    named.
     """
     remaining = replace(files, cameras=None, images=None if files.images == files.cameras else files.images)
     load = _read_views(ply, remaining, hints, photos=photos)
@@ -222,10 +222,9 @@ def _read_without_cameras(
 
 
 def _choose_cameras(ply: GaussianFile, files: SceneFiles, hints: ReadHints, *, photos: bool) -> Loaded | SceneError:
-    """Read a scene with the first of its camera files that certainly fits, or else with the first that can be read.
+    """Read a scene with its first camera file that certainly fits, or else with the first that can be read.
 
-    If there are several camera files, a note says which one is read. Returns the first error if the scene can be read
-    with no camera file.
+    If there are several camera files, a note says which one is read. If none can be read, returns the first error.
     """
     loads, errors = list[Loaded](), list[SceneError]()
     for choice in files.choices:
