@@ -20,7 +20,8 @@ from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.reproject import follow_pixels
 
 _MIN_SIDE, _MAX_WIDTH = 16, 2048  # fewest and most pixels of a line
-# A length of lines is tried if at least _MIN_SHARE of the sampled rows show it. At most _MAX_LENGTHS lengths are tried
+# A length of lines is tried if at least the share _MIN_SHARE of the sampled rows shows it. At most _MAX_LENGTHS lengths
+# are tried
 _MIN_SHARE, _MAX_LENGTHS = 0.02, 2
 # The step from the end of a line back to the left edge is at least _WRAP times the usual step. The step from the first
 # point of a line to the first point of the next line is at most _BELOW times the step back to the left edge
@@ -92,7 +93,7 @@ def _find_views(points: np.ndarray, length: int) -> list[_GridView]:
     ``points [n,3]`` are the means of all rows. Each view is extended from a series of complete lines. A series that
     fits its camera worse than the best series fits a camera is left out.
     """
-    num_first, max_series = 12, 200  # the best of the first num_first series is the measure; at most max_series count
+    num_first, max_series = 12, 200  # the measure is the best of the first num_first series; at most max_series count
     series = _find_lines(points, length)[:max_series]
     first_views = [_solve_lines(points, starts) for starts in series[:num_first]]
     best_px = min((view.px for view in first_views if view is not None), default=None)

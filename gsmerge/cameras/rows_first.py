@@ -43,7 +43,7 @@ from gsmerge.runtime.memory import free_pages
 from gsmerge.types import Cameras
 
 _EVIDENCE = "Gaussians' places in their pixels"  # what shows that a frame is right, in words
-_PLAIN_PX = 0.5  # if rows in plain order are nearer to their pixels than this, in pixels, no other cameras are tried
+_PLAIN_PX = 0.5  # pixels; if rows that are all pixels in order have a smaller error, no other cameras are tried
 _MOST_PLACES = 1 << 27  # largest number of rows times views for which rows are followed; each takes four bytes
 
 
@@ -226,7 +226,7 @@ def _place_layout(source: RowSource, grid: Grid, layout: Layout) -> Recovery | N
     if len(solved) == len(grid.cameras):
         poses = np.stack([solved[view] for view in range(len(solved))])
         solved_px = check_pairs(pairs, replace(grid.cameras, viewmats=poses)).worst_px
-        rounding_px = 0.1  # cameras of the file may be worse than solved poses by this, since files round numbers
+        rounding_px = 0.1  # a file's cameras may err more than solved poses by this, since files round numbers
         limit = max(AS_NEAR * solved_px, solved_px + rounding_px)
         for other in _list_conventions(source, grid):
             frame = fit_frame(other.cameras, poses, source.scale)

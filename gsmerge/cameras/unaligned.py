@@ -216,7 +216,7 @@ def choose_cameras(
         return PlacedGrid(grid, frame, "photos' colours"), []
     if not check.ok:
         remedy = f"{no_pixels.remedy}, or write their shift (x y z) to offset.txt beside the file"
-        if check.share_seen > 0.5:  # most Gaussians are in view, so only the colours contradict the cameras
+        if check.share_seen > 0.5:  # the views see most Gaussians, so only the colours contradict the cameras
             remedy += "; if the cameras are right, the photos or the colours of the file are wrong: --images none keeps"
             remedy += " the cameras, and --hint colors=rgb reads f_dc as RGB"
         raise SceneError(no_pixels.path, f"{no_pixels.problem}; {check.description}", remedy)
@@ -351,7 +351,7 @@ def _solve_shift(inputs: AlignmentInput) -> list[Similarity]:
     places = sorted(product(*_PLACES), key=lambda place: -score(place, first_samples))
     best: list[tuple[float, ...]] = places[:first_places]
     for samples, count, step in _SHIFT_STEPS:
-        # tried are each place, and the places one step along each axis in both directions
+        # each place is tried, and so are the places one step away along each axis
         offsets = step * np.concatenate([np.zeros((1, 3)), np.diag((1, 1, 2.5)), -np.diag((1, 1, 2.5))])
         around = {tuple((place + offset).tolist()) for place in best for offset in offsets}
         best = sorted(sorted(around), key=lambda place: -score(place, samples))[:count]

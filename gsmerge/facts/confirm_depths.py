@@ -23,8 +23,8 @@ from gsmerge.types import Cameras, Scene
 
 CONFIRM_PIXELS = 1200  # sampled pixels of a view
 CONFIRM_NEIGHBORS = 16  # nearest other views in which the sampled pixels are looked up
-# Largest distance from a pixel at which its point, projected back, agrees with it: AGREEMENT_SHARE as a share of the
-# longer side, but at least AGREEMENT_PIXELS
+# A point that is projected back agrees with its pixel up to a distance: the share AGREEMENT_SHARE of the longer side,
+# but at least AGREEMENT_PIXELS
 AGREEMENT_SHARE, AGREEMENT_PIXELS = 1 / 120, 1.5
 SAME_LOG_DEPTH = 0.05  # difference of the logarithms of two depths of one surface
 LEAST_DEPTH = 1e-9  # least depth, canonical units
@@ -40,7 +40,7 @@ THIRDS = {
     "left third": ((0, 1), (0, 3)), "right third": ((2, 3), (0, 3)), "upper third": ((0, 3), (0, 1)),
     "lower third": ((0, 3), (2, 3)), "middle": ((1, 2), (1, 2)),
 }  # fmt: skip
-POOR_PART_SHARE = 0.5  # share of the pixels of a part, above which the part is poor
+POOR_PART_SHARE = 0.5  # share of a part's pixels
 # The useful number of Gaussians per pixel is MOST_PER_PIXEL if at least SOUND_SHARE of the pixels are confirmed, and
 # FEWEST, the usual number, if at most WRONG_SHARE are confirmed. With more Gaussians than are useful, a fit memorises
 # the photos (docs/guide/how-many.md). With MOST_PER_PIXEL instead of FEWEST, captures whose depth was confirmed lost at
@@ -154,7 +154,7 @@ def _look_up_pixels(scene: Scene, view: int, rows: np.ndarray) -> tuple[np.ndarr
     surface = means.take(front[has_front], 0).astype(np.float64)  # the points that the neighbours show at these pixels
     distance = _distance_back(surface, rows[ids], cameras[[view]])
     surface_depths = camera_depths(surface, cameras.viewmats[neighbors[neighbor_ids]])
-    # how far the point is behind the neighbour's surface (above 0), or in front of this surface (below 0)
+    # distance of the point behind the neighbour's surface; negative in front of the surface
     log_depths = log(depths[neighbor_ids, ids] / np.maximum(surface_depths, LEAST_DEPTH))
     agrees = (distance < 1) & (np.abs(log_depths) < SAME_LOG_DEPTH)
     sees_through = ~agrees & ((log_depths < -2 * SAME_LOG_DEPTH) | ((log_depths < 0) & (distance > 2)))

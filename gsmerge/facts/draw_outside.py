@@ -71,7 +71,7 @@ def _place_beside(gaussians: Gaussians, outside: np.ndarray, cameras: Cameras) -
     sources = cameras[even_views(len(cameras), min(len(cameras), SOURCES))]
     back = outside_cameras(sample.means, sources, STEPS_BACK * len(sources), BESIDE_LOW, BESIDE_HIGH)
     candidates = concat_cameras(back, _turn_around(sources))
-    least_added = 0.2  # a further camera is placed if it adds more than this share of what those before it show
+    least_added = 0.2  # a further camera is placed if it adds more than this share to what earlier cameras show
     return candidates[choose_showing(sample, candidates, outside[::step], least_added)]
 
 

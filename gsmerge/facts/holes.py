@@ -45,7 +45,7 @@ FARTHEST_QUANTILE = 0.99  # quantile of the depths that counts as the farthest
 HOLE_NEIGHBORS = 3  # number of nearest views that a picture is compared with
 DIFFERENCE_BLUR = 3.0  # standard deviation in pixels of the window over which differences are averaged
 NEW_SIZE_PIXELS, NEW_OPACITY = 0.75, 0.9  # standard deviation in pixels, and opacity, of a new Gaussian
-BARE = 0.02  # opacity up to which a pixel's own Gaussian shows nothing
+BARE = 0.02  # opacity up to which the Gaussian of a pixel shows nothing
 
 
 def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = False) -> PicturedScene:
@@ -221,7 +221,7 @@ def _choose_depths(
     neighbor_rays = [_rays_in(scene.cameras, neighbor, centres[view], rays) for neighbor in neighbors]
     colors, pixels = scene.images[view][holes], np.flatnonzero(holes)
     best_depths, best_costs = depths[0], np.full(len(rays), np.inf, np.float32)
-    min_gain = 0.001  # least gain in the difference of colours (sRGB) for each step to a farther depth
+    min_gain = 0.001  # decrease in the difference of colours (sRGB) that each step to a farther depth has to bring
     min_weight = 1e-3  # least weight, in the window of DIFFERENCE_BLUR, of pixels that other views see
     for step, depth in enumerate(depths):
         sums = np.zeros((*holes.shape, 2), np.float32)  # sums of differences, and numbers of differences

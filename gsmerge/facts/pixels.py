@@ -64,7 +64,7 @@ def raise_sizes(scene: SceneT, *, placed: bool = False) -> SceneT:
     units = find_nearest(g.means, 1)[1][:, 0] if by_distance else measure_pixel_sizes(g.means, homes, cameras)
     sizes, seen = g.scales.max(1), (homes >= 0) | by_distance
     num_sharing = 1 if by_distance else np.where(seen, np.bincount(homes + 1)[homes + 1], 1)
-    is_near = units < 1  # a pixel that is as large as the scene's median depth, or larger, is no measure of sizes
+    is_near = units < 1  # sizes are not compared with pixels as large as the scene's median depth, or larger
     hidden = (sizes * np.sqrt(num_sharing) < HIDDEN_SIZE * LOW_PASS * units) & is_near
     if np.count_nonzero(hidden & seen) <= FEWEST_HIDDEN * np.count_nonzero(seen):
         return scene

@@ -213,7 +213,7 @@ def place_cameras(gaussians: Gaussians, num_views: int = NUM_VIEWS) -> Cameras:
     viewmats = _candidate_viewmats(centre, half)
     candidates = Cameras(viewmats, np.repeat(_square_intrinsics(PROBE)[None], len(viewmats), 0), PROBE, PROBE)
     shares = _shares_seen(sample, candidates, NEAR_PLANE_SHARE * float(np.sqrt((half * half).sum())))
-    least_gain = 1e-3  # a camera is added if it raises the opacity that all chosen cameras show by more than this share
+    least_gain = 1e-3  # a camera is added if it raises the shown opacity by more than this share
     best = _choose_candidates(shares, num_views, least_gain)
     size = int(np.clip(round(math.sqrt(len(gaussians))), SMALLEST_PIXELS, LARGEST_PIXELS))
     return Cameras(viewmats[best], np.repeat(_square_intrinsics(size)[None], len(best), 0), size, size)

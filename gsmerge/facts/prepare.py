@@ -58,7 +58,7 @@ class Prepared:
     """A scene in its canonical frame, as the stages use it, with facts about it."""
 
     input_scene: Scene  # The scene as it was read, in its own world frame, with photos that look like its Gaussians
-    # The canonical scene with pixels. The scene has every view once, and photos that do not show it are replaced
+    # The canonical scene with pixels. It has every view once, and photos that do not show it are replaced
     scene: PicturedScene
     frame: Frame  # The canonical frame
     reference: Reference  # Use of the pictures

@@ -53,7 +53,7 @@ _UNKNOWN_KEYS = (
     "camera_format", "rows", "alignment", "alignment_problem", "sight", "compact", "auto", "agreement", "num_unseen",
 )  # None unless the views are known  # fmt: skip
 _CAMERA_ELEMENTS = ("extrinsic", "intrinsic", "image_size")  # elements of a .ply that hold its camera
-_REPEATED = "read as: "  # beginning of notes that say the same as the line "rows"
+_REPEATED = "read as: "  # first words of notes that repeat the line "rows"
 _ENCODINGS = {"logit": "as logits", "raw": "in [0, 1]"}  # words for the encodings of opacities
 
 

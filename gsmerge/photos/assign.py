@@ -261,7 +261,7 @@ class Assigner:
         step, tag = -(-len(photos) // FIRST_PHOTOS), self.candidates.tag
         compared = set(range(0, len(photos), step))  # indices into ``photos``
         max_compared = 4  # number of photos that are compared with a view part by part
-        while True:  # until the best photos of all views have no neighbours that were not compared
+        while True:  # until all neighbours of the views' best photos are compared
             scores = self.score_in_views(photos[index] for index in sorted(compared))
             best = scores.best()
             columns = {view: np.argsort(-best[view], kind="stable")[:max_compared] for view in views}

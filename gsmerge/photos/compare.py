@@ -280,7 +280,7 @@ def _note_hidden(scene: PicturedScene, hidden: np.ndarray, views: Sequence[int])
     """Note in which photos of ``views`` something covers the scene, at the pixels ``hidden [v,h,w]``."""
     with_hidden = [view for view in views if hidden[view].any()]
     max_percent = 100 * max((float(hidden[view].mean()) for view in with_hidden), default=0)
-    noted_percent = 1  # there is no note if less than this of every photo is covered
+    noted_percent = 1  # there is no note if no photo is covered by at least this percentage
     if max_percent < noted_percent:
         return
     note(

@@ -217,7 +217,7 @@ def choose_partners(distances: np.ndarray) -> np.ndarray:
 def _solve_gains(pairs: Sequence[_Pair], num_views: int) -> np.ndarray:
     """Solve for the logarithmic gains ``[v,3]`` of all views, with mean zero; without pairs all gains are zero."""
     matrix, right = np.full((num_views, num_views), 1.0 / num_views), np.zeros((num_views, 3))
-    max_weighted_pixels = 1000  # more shared pixels give a pair of views no larger weight
+    max_weighted_pixels = 1000  # above this number of shared pixels, the weight of a pair of views does not grow
     for pair in pairs:
         ends, weight = [pair.view, pair.other], np.sqrt(min(pair.count, max_weighted_pixels))
         matrix[np.ix_(ends, ends)] += weight * np.array([[1, -1], [-1, 1]])

@@ -28,7 +28,7 @@ class ViewPictures:
 
     pictures: np.ndarray  # [v,h,w,3] colours in [0, 1], as of solid Gaussians; 0 where nothing is shown
     weights: np.ndarray  # [v,h,w] opacity, in [0, 1]; 0 outside masks
-    drawn: bool  # True for renders, which wrong depth displaces; False for colours of each view's own Gaussians
+    drawn: bool  # True for renders, which wrong depth displaces; False for colours of the Gaussians at their pixels
 
     def __len__(self) -> int:
         return len(self.pictures)

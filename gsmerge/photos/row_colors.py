@@ -25,8 +25,8 @@ from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import in_turn
 from gsmerge.types import PicturedScene, Scene
 
-# Names, in messages, of the pictures to which results are fitted and with which results are compared. If photos are
-# missing, the pictures are the colours of the rows, or renders if the rows belong to no pixels
+# Names, in messages, of the pictures to which results are fitted and with which they are compared. Without photos,
+# these pictures are the colours of the rows, or renders if the rows belong to no pixels
 OWN_PHOTOS = "the scene's own photos"
 PHOTOS = "photos"
 ROW_COLORS = "the model's own pixels"
@@ -34,8 +34,8 @@ RENDERS = "renders of the input"
 NO_PHOTOS = f"no photos: {ROW_COLORS} are used instead; name photos with --images"
 FAINT_OPACITY = 0.1  # opacity of a pixel's Gaussians below which their colours mean little
 # Standard deviation in pixels. After this blur, colours from photos differ from drawings by at most .18 of [0, 1] in
-# the exports of nine captures. After a blur of only 2 pixels, colours and drawings differ by .39 where Gaussians of
-# wrong depth hide others
+# the exports of nine captures. After a blur of only 2 pixels, they differ by .39 where Gaussians of wrong depth hide
+# others
 ROW_BLUR_PIXELS = 8.0
 T = TypeVar("T")
 

@@ -147,7 +147,7 @@ def stage(name: str) -> Iterator[None]:
     if record is None or record.running is not None:
         yield
         return
-    if name not in record.seconds:  # the second part of a stage is not a new step
+    if name not in record.seconds:  # if a stage continues after a break, this is not a new step
         report_progress(name, STAGES.index(name) if name in STAGES else len(record.seconds), len(STAGES))
     record.running, start = name, time.perf_counter()
     try:

@@ -105,7 +105,7 @@ def connect(matches: KeypointMatches) -> tuple[Similarity, KeypointMatches] | No
     best = int(np.argmax([(1 - trial_squares / AGREE).clip(0).sum() for trial_squares in squares]))
     similarities: Similarities = (trials[best], IDENTITY)
     agree = squares[best] < AGREE
-    rounds = 3  # in each, the similarity is refined and the agreeing matches are selected anew
+    rounds = 3  # each round refines the similarity, and selects the agreeing matches anew
     for _ in range(rounds):
         if agree.sum() < MIN_MATCHES // 2:
             return None
@@ -222,7 +222,7 @@ def _measure_spreads(
     Returns the matches with the standard deviation of keypoints, and the standard deviation of logarithms of depths.
     """
     errors = [_two_way_residuals(similarities, pair, DEPTH_SPREAD)[0].values for pair in matches]
-    # residuals are in standard deviations; here they become pixels, and differences of logarithms of depths
+    # converts residuals from standard deviations to pixels, and to differences of logarithms of depths
     lengths = [pair.spread * np.sqrt((xyz[:, :2] ** 2).sum(1)) for pair, xyz in zip(matches, errors, strict=True)]
     depth_errors = np.abs(np.concatenate(errors)[:, 2]) * DEPTH_SPREAD
     depth_spread = NORMAL_SPREAD * float(lower_median(depth_errors))
