@@ -78,7 +78,7 @@ def _find_line_lengths(points: np.ndarray) -> list[int]:
 
 @dataclass(frozen=True, eq=False)
 class _GridView:
-    """Consecutive rows of one view, with their pixels. Columns and lines are counted from any first column and line."""
+    """Consecutive rows of one view, with their pixels. Columns and lines may be counted from any number."""
 
     rows: np.ndarray  # ``[p]`` in order
     x: np.ndarray  # ``[p]`` columns of the pixels
@@ -90,8 +90,8 @@ class _GridView:
 def _find_views(points: np.ndarray, length: int) -> list[_GridView]:
     """Find the views whose lines have ``length`` rows, in the order of their rows.
 
-    ``points [n,3]`` are the means of all rows. Each view is extended from a series of complete lines. A series that
-    fits its camera worse than the best series fits a camera is left out.
+    ``points [n,3]`` are the means of all rows. Each view is extended from a series of complete lines. A series is left
+    out if it fits its camera worse than the best series fits its camera.
     """
     num_first, max_series = 12, 200  # the measure is the best of the first num_first series; at most max_series count
     series = _find_lines(points, length)[:max_series]

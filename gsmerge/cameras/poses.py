@@ -56,7 +56,7 @@ def describe_convention(convention: Convention) -> str:
 
 
 def other_conventions(viewmats: np.ndarray, convention: Convention) -> list[PosesInConvention]:
-    """List the poses that a file has if it is read in each other convention than ``convention``.
+    """List the poses of a file as read in each convention other than ``convention``.
 
     ``viewmats [c,4,4]`` are the poses of the file in ``convention``. Poses that are equal in two conventions are listed
     once.

@@ -123,7 +123,7 @@ def _interleaved_stretches(count: int, views: int, per_pixel: int, num_pixels: i
 
 
 def _fused_stretches(count: int, views: int, num_pixels: int) -> list[_Stretch]:
-    """List stretches of rows of the first and of the last view, for views of ``num_pixels`` that were fused in order.
+    """List stretches of rows of the first and the last view, if views of ``num_pixels`` pixels were fused in order.
 
     ``count`` is the number of all rows. The rows of the first view come first, and the rows of the last view last. The
     list is empty for too few or too many rows.

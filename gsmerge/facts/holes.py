@@ -158,7 +158,7 @@ def large_parts(empty: np.ndarray) -> np.ndarray:
 def _leave_empty(scene: PicturedScene, empty: np.ndarray) -> PicturedScene:
     """Return a scene whose pictures are black, and do not count in scores, at pixels that stay ``empty [v,h,w]``.
 
-    A note says at which share of the pixels photos no longer count.
+    A note says what share of the pixels no longer counts.
     """
     if not empty.any() or empty.all():
         return scene

@@ -107,7 +107,7 @@ def map_colors(matrix: np.ndarray, photo: np.ndarray) -> np.ndarray:
 
 
 def vary_in_hue(colors: np.ndarray, weights: np.ndarray) -> float:
-    """Measure what part of the colours ``[n,3]`` does not follow from their brightness, weighted by ``weights [n]``.
+    """Measure how far colours ``[n,3]``, with ``weights [n]``, are from colours that depend only on brightness.
 
     The result is the root mean square distance of the colours from the best tone curve of their grey levels. The result
     is about 0 for grey photos, and for photos of a single tint.

@@ -55,7 +55,7 @@ NEAREST_VIEWS, FARTHER_VIEWS = 6, 2
 
 @dataclass(frozen=True, eq=False)
 class _Pair:
-    """How much brighter another view shows the surfaces of a view's pixels."""
+    """Measured ratio of brightness between two views, from surfaces that both show."""
 
     view: int
     other: int
