@@ -1,13 +1,12 @@
 """Align rows with cameras: find the pixel of each row, and the cameras that show the Gaussians in place.
 
-``rows_first`` tries three cases, one after the other. In the first case, rows in plain order are the pixels of their
-cameras. To test this, ``poses`` reads poses in other conventions and moves inexact cameras. In the second case, rows
-are in the order of the pixels, while some pixels have no row. To test this, ``dropped_rows`` follows the rows through
-the pixels, in each frame that exporters use (``frames``). In the third case, rows have no pixels. For these rows
-``unaligned`` chooses cameras by the colours of the photos, and ``upright`` solves for cameras if no file stores the
-frame of the rows.
+``rows_first`` tries three cases, one after the other. In the first case, each pixel has a row, in order. The test reads
+poses in other conventions and moves inexact cameras (``poses``). In the second case, rows are in the order of the
+pixels, but some pixels have no row. The test follows the rows through the pixels (``dropped_rows``), in each frame that
+exporters use (``frames``). In the third case, rows have no pixels. Then ``unaligned`` chooses cameras by the colours of
+the photos, and ``upright`` solves for cameras if no file stores the frame of the rows.
 
-``grids`` has the sizes that cameras and photos can have. ``estimate`` solves for the cameras if no file gives them, and
+``grids`` brings cameras and photos to one size. ``estimate`` solves for the cameras if no file gives them, and
 ``explain`` reports why rows do not fit. The modules are private. Modules that few files need are loaded at first use.
 """
 

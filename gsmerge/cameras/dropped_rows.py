@@ -1,9 +1,8 @@
-"""Find the pixels of rows, which are view by view and line by line, from the rows alone if some pixels have no row.
+"""Find pixels from rows alone, if rows are sorted by view, line and column, and some pixels have no row.
 
-Some lines are complete, for example in the middle of views without borders and far pixels. Where lines are complete,
-the long step back to the left edge repeats once per line. A projective camera is solved from a few complete lines. This
-camera shows the pixels of the lines before and after the complete lines, up to the end of the view, even if those lines
-are incomplete.
+If borders and far pixels have no rows, lines in the middle of views may still be complete. Between complete lines, the
+long step from the right edge back to the left repeats at equal distances. A projective camera is solved from a few
+complete lines. Projection by this camera gives the pixels of rows in incomplete lines, too.
 """
 
 from __future__ import annotations
@@ -21,7 +20,8 @@ from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.reproject import follow_pixels
 
 _MIN_SIDE, _MAX_WIDTH = 16, 2048  # fewest and most pixels of a line
-# A length of lines is tried if at least _MIN_SHARE of the sampled rows show it. At most _MAX_LENGTHS lengths are tried
+# A length of lines is tried if at least the share _MIN_SHARE of the sampled rows shows it. At most _MAX_LENGTHS lengths
+# are tried
 _MIN_SHARE, _MAX_LENGTHS = 0.02, 2
 # The step from the end of a line back to the left edge is at least _WRAP times the usual step. The step from the first
 # point of a line to the first point of the next line is at most _BELOW times the step back to the left edge
@@ -29,7 +29,7 @@ _WRAP, _BELOW = 8.0, 0.25
 _MIN_LINES = 6  # fewest complete lines in a series
 _SOLVED_FROM = 800  # rows of a view that its camera is solved from
 _MAX_PX = 1.0  # largest median distance of a view's rows from their pixels
-# A camera that was solved from n lines is used for the next _AHEAD * n lines, or for _MIN_AHEAD lines if that is more
+# A camera that was solved from n lines is used for the next _AHEAD * n lines, but for at least _MIN_AHEAD lines
 _AHEAD, _MIN_AHEAD = 0.3, 2
 _MIN_PLACED = 0.9  # share of the rows that must have a pixel
 
@@ -78,7 +78,7 @@ def _find_line_lengths(points: np.ndarray) -> list[int]:
 
 @dataclass(frozen=True, eq=False)
 class _GridView:
-    """Consecutive rows of one view, with their pixels. Columns and lines are counted from any first column and line."""
+    """Consecutive rows of one view, with their pixels. Columns and lines may be counted from any number."""
 
     rows: np.ndarray  # ``[p]`` in order
     x: np.ndarray  # ``[p]`` columns of the pixels
@@ -90,10 +90,10 @@ class _GridView:
 def _find_views(points: np.ndarray, length: int) -> list[_GridView]:
     """Find the views whose lines have ``length`` rows, in the order of their rows.
 
-    ``points [n,3]`` are the means of all rows. Each view is extended from a series of complete lines. A series that
-    fits its camera worse than the best series fits a camera is left out.
+    ``points [n,3]`` are the means of all rows. Each view is extended from a series of complete lines. A series is left
+    out if it fits its camera worse than the best series fits its camera.
     """
-    num_first, max_series = 12, 200  # the best of the first num_first series is the measure; at most max_series count
+    num_first, max_series = 12, 200  # the measure is the best of the first num_first series; at most max_series count
     series = _find_lines(points, length)[:max_series]
     first_views = [_solve_lines(points, starts) for starts in series[:num_first]]
     best_px = min((view.px for view in first_views if view is not None), default=None)
@@ -131,8 +131,8 @@ def _find_lines(points: np.ndarray, length: int) -> list[np.ndarray]:
 def _link_lines(rows: np.ndarray, points: np.ndarray, limits: np.ndarray, length: int) -> np.ndarray:
     """Return for each of ``rows [r]``, which may begin lines, the index ``[r]`` of the line before it; -1 for none.
 
-    The line before begins ``length`` rows earlier. The first points of a line and of the line before, among ``points
-    [r,3]``, are less than ``limits [r]`` apart.
+    The line before begins ``length`` rows earlier. The first point of a line, among ``points [r,3]``, is less than
+    ``limits [r]`` from the first point of the line before.
     """
     before, least = np.full(len(rows), -1), limits
     for back in range(1, len(rows)):
@@ -150,8 +150,8 @@ def _link_lines(rows: np.ndarray, points: np.ndarray, limits: np.ndarray, length
 def _collect_series(rows: np.ndarray, before: np.ndarray) -> list[np.ndarray]:
     """Collect series of consecutive lines, the longest series first; no line is in two series.
 
-    ``rows [r]`` begin the lines, and ``before [r]`` is the index of the line before each line, or -1 for none. A series
-    is returned as the rows that begin its lines.
+    ``rows [r]`` begin the lines, and ``before [r]`` is the index of the line before each line, or -1 for none. The
+    result lists, for each series, the rows that begin its lines.
     """
     num_before = np.zeros(len(rows), np.int64)  # number of lines before each line in its series
     for i, previous in enumerate(before.tolist()):
@@ -226,9 +226,8 @@ def follow_rows(
 ) -> np.ndarray:
     """Find pixels ``[n]`` of rows at ``points [n,3]`` float32 so that most rows are in the order of pixels.
 
-    The cameras are ``viewmats [v,4,4]`` and ``Ks [v,3,3]``. Rows out of order get the pixel -1. The order of pixels is
-    view by view and line by line. If ``mixed`` is True, the order is line by line, and the rows of one pixel in all
-    views follow each other.
+    The cameras are ``viewmats [v,4,4]`` and ``Ks [v,3,3]``. Rows out of order get the pixel -1. Pixels are in the order
+    of view, line and column, or with ``mixed``, of line, column and view.
     """
     count, views = len(points), len(viewmats)
     ids = np.empty(count, np.int64)

@@ -17,8 +17,8 @@ from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, StoredView, m
 def estimate_cameras(path: Path, means: np.ndarray, valid: np.ndarray) -> CameraFile | None:
     """Estimate the cameras of rows ``means [n,3]`` that are the pixels of a grid; None for other rows.
 
-    The rows are sorted view by view, or the rows of one pixel in all views follow each other. Whatever the order of the
-    rows, some pixels may have no row. ``valid [n]`` bool marks the finite rows, and ``path`` is for messages.
+    The rows are sorted by view, line and column, or by line, column and view. In both orders some pixels may have no
+    row. ``valid [n]`` bool marks the finite rows, and ``path`` is for messages.
     """
     rows, step = np.arange(len(means)), _find_pixel_step(means)
     orders = (rows, rows.reshape(-1, step).T.reshape(-1)) if step > 1 and len(rows) % step == 0 else (rows,)
@@ -43,9 +43,8 @@ def estimate_cameras(path: Path, means: np.ndarray, valid: np.ndarray) -> Camera
 def _find_pixel_step(means: np.ndarray) -> int:
     """Find the step in rows from a pixel to the next pixel of the same view.
 
-    Of all pairs of points ``means [n,3]``, the pairs that are the found step apart are nearest to each other. The step
-    is the number of views if the rows of one pixel in all views follow each other. For other rows, and for few rows,
-    the step is 1.
+    At this distance in rows, pairs of points ``means [n,3]`` are nearest to each other. The step is the number of views
+    if rows are sorted by line, column and view. For other rows, and for few rows, the step is 1.
     """
     most_views = 64  # largest step that is tried
     min_pixels = 256  # fewest pixels of a view

@@ -117,7 +117,7 @@ def solve_frame(
 
 
 def solve_poses(pairs: Correspondences, Ks: np.ndarray) -> dict[int, np.ndarray]:
-    """Return the pose ``[4,4]`` of each view, solved from its own pixels only, without views for which that fails."""
+    """Solve for the pose ``[4,4]`` of each view from its own pixels; views whose solution fails are left out."""
     poses = ((int(view), solve_pose(pairs, int(view), Ks[view])) for view in distinct(pairs.views))
     return {view: pose for view, pose in poses if pose is not None}
 

@@ -27,7 +27,7 @@ class Grid:
     transform: PhotoTransform | None  # transform of the photos to the grid; None: photos stay as they are
     notes: tuple[str, ...]  # notes for the user, one sentence each
     moves: Sequence[dict[str, Any]] = ()  # how far each camera was moved to its Gaussians; empty if none was moved
-    # ``[c,4,4]`` poses as read, to which the Gaussians have to move, because photos confirm these poses; otherwise None
+    # ``[c,4,4]`` poses as read, if photos confirm them, so that the Gaussians have to move instead; otherwise None
     confirmed_viewmats: np.ndarray | None = None
 
     @property

@@ -1,4 +1,4 @@
-"""Lay out rows as pixels of views. Rows are all pixels in order, or some pixels have no row."""
+"""Lay out rows as pixels of views. Each pixel has a row, or some pixels have none."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Layout:
     views: int
     width: int  # pixels
     height: int
-    # "view-major": view by view and line by line. "view-fastest": the rows of one pixel in all views follow each other
+    # "view-major": view by view and line by line. "view-fastest": pixel by pixel, with all views of a pixel in turn
     order: str = "view-major"
     # ``[n]`` the pixel ``(view·H + y)·W + x`` of each row, -1 for a row without one; None if the rows are all pixels in
     # order

@@ -1,9 +1,9 @@
 """Read poses in another convention, and move inexact cameras.
 
-Models that predict poses write Gaussians that lie a little beside the pixels of their cameras. The pixels of a view and
-their Gaussians determine the pose of the view, and its camera is moved to this pose. If photos agree better with the
-poses as read, the Gaussians are wrong, and the result is marked as ``confirmed``. Views whose photos disagree are moved
-later (``gsmerge/facts/move_poses.py``).
+If a model predicts poses, its Gaussians lie a little beside the pixels of their cameras. The pixels of a view and their
+Gaussians determine the pose of the view, and its camera is moved to this pose. If photos agree better with the poses as
+read, the Gaussians are wrong, and the result is marked as ``confirmed``. If photos of different views then disagree,
+``gsmerge/facts/move_poses.py`` moves the views later.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def describe_convention(convention: Convention) -> str:
 
 
 def other_conventions(viewmats: np.ndarray, convention: Convention) -> list[PosesInConvention]:
-    """List the poses that a file has if it is read in each other convention than ``convention``.
+    """List the poses of a file as read in each convention other than ``convention``.
 
     ``viewmats [c,4,4]`` are the poses of the file in ``convention``. Poses that are equal in two conventions are listed
     once.
@@ -105,9 +105,9 @@ def move_cameras(
     """Move cameras so that sampled Gaussians project into their pixels; None if a camera is too far from its pixels.
 
     If changed intrinsics fit as well as moved poses, the intrinsics are changed instead. Only principal points in the
-    middle of the image may change, because these were probably just assumed. A change of other intrinsics raises
-    SceneError, which names ``source``. ``names`` are the names of the views. ``images [c,h,w,3]`` are photos, which may
-    confirm the poses as read; they may be empty.
+    middle of the image may change, because these were probably just assumed. If other intrinsics would change, a
+    SceneError that names ``source`` is raised. ``names`` are the names of the views. ``images [c,h,w,3]`` are photos,
+    which may confirm the poses as read; they may be empty.
     """
     before = check_pairs(pairs, cameras)
     if not before.worst_px <= max_correctable_px(cameras.width, cameras.height):

@@ -1,9 +1,9 @@
 """Find the cameras that show the Gaussians of a file in place, and the pixel of each row if rows are pixels in order.
 
-Rows in plain order determine the pose of each view. Plain order is recognised if one similarity moves the file's
-cameras to the poses that rows determine. If some pixels may have no row, the rows are followed through the pixels, in
-each frame that exporters use. Rows in another order have no pixels, and only cameras are chosen for these rows, by the
-colours of the photos.
+If each pixel has a row, in order, the rows determine the pose of each view. This order is accepted if one similarity
+moves the file's cameras to these poses. If some pixels may have no row, the rows are followed through the pixels, in
+each frame that exporters use. For rows in another order no pixels are found, and cameras are chosen by the colours of
+the photos.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from gsmerge.runtime.memory import free_pages
 from gsmerge.types import Cameras
 
 _EVIDENCE = "Gaussians' places in their pixels"  # what shows that a frame is right, in words
-_PLAIN_PX = 0.5  # if rows in plain order are nearer to their pixels than this, in pixels, no other cameras are tried
+_PLAIN_PX = 0.5  # pixels; if rows that are all pixels in order have a smaller error, no other cameras are tried
 _MOST_PLACES = 1 << 27  # largest number of rows times views for which rows are followed; each takes four bytes
 
 
@@ -114,11 +114,11 @@ class AlignmentResult:
     transform: PhotoTransform | None = None  # applied to the photos
     recovery: Recovery | None = None  # where the pixels of the rows lie; None without pixels
     moves: Sequence[dict[str, Any]] = ()  # how far each camera was moved to its Gaussians; empty if none was moved
-    # ``[c,4,4]`` poses as read, to which views have to move with their Gaussians, because photos confirm these poses;
-    # otherwise None
+    # ``[c,4,4]`` poses as read, if photos confirm them, so that the views' Gaussians have to move instead; otherwise
+    # None
     confirmed_viewmats: np.ndarray | None = None
     problem: str | None = None  # why the rows have no pixels; None if they have
-    # Number of views of the grid that the rows form by themselves, if they are no pixels of ``cameras``; else 0
+    # Number of views that the rows form on their own, if the rows are pixels, but not of ``cameras``; else 0
     own_views: int = 0
 
 
@@ -226,7 +226,7 @@ def _place_layout(source: RowSource, grid: Grid, layout: Layout) -> Recovery | N
     if len(solved) == len(grid.cameras):
         poses = np.stack([solved[view] for view in range(len(solved))])
         solved_px = check_pairs(pairs, replace(grid.cameras, viewmats=poses)).worst_px
-        rounding_px = 0.1  # cameras of the file may be worse than solved poses by this, since files round numbers
+        rounding_px = 0.1  # a file's cameras may err more than solved poses by this, since files round numbers
         limit = max(AS_NEAR * solved_px, solved_px + rounding_px)
         for other in _list_conventions(source, grid):
             frame = fit_frame(other.cameras, poses, source.scale)
@@ -266,7 +266,7 @@ def _move_to_rows(source: RowSource, grid: Grid, layout: Layout) -> Grid:
 def _follow_order(source: RowSource, grid: Grid, frames: Iterable[Similarity]) -> Recovery | None:
     """Find the pixels of rows in the order of the pixels, if some pixels have no row; None for rows in another order.
 
-    Each of ``frames`` is tried, with both orders: view by view, and pixel by pixel with the rows of all views.
+    Each of ``frames`` is tried with both orders: by view, line and column, and by line, column and view.
     """
     rows = np.flatnonzero(source.ply.valid)
     if len(rows) > len(grid.cameras) * math.prod(grid.size) or len(rows) * len(grid.cameras) > _MOST_PLACES:
@@ -296,8 +296,7 @@ def _list_frames(source: RowSource, grid: Grid) -> Iterator[Similarity]:
 def _follow_pixels(points: np.ndarray, cameras: Cameras, *, mixed: bool) -> np.ndarray | None:
     """Find the pixels ``[n]`` of rows, at ``points [n,3]``, in the order of the pixels; None for rows in another order.
 
-    A few rows may have no pixel; their result is -1. If ``mixed`` is True, the rows of one pixel in all views follow
-    each other.
+    A few rows may have no pixel; their result is -1. If ``mixed`` is True, rows are sorted by line, column and view.
     """
     matrices = np.ascontiguousarray(cameras.viewmats, np.float64), np.ascontiguousarray(cameras.Ks, np.float64)
     ids = None

@@ -16,8 +16,8 @@ from gsmerge.types import Cameras, Gaussians, Scene
 
 SHUFFLED_MARGIN = 5.0  # factor by which Gaussians must be nearer to their pixels than to shuffled pixels
 # Two medians of some 400 distances differ by chance. The median of n distances in a plane has a relative standard error
-# of 0.72 / sqrt(n), so the ratio of two medians has a standard error of 5 %, and 1.15 is three standard errors. Files
-# round the numbers of cameras, which displaces projections by up to 0.02 pixels
+# of 0.72 / sqrt(n), so the ratio of two medians has a standard error of 5 %, and a ratio of 1.15 is three standard
+# errors above 1. Files round the numbers of cameras, which displaces projections by up to 0.02 pixels
 AS_NEAR, AS_NEAR_PX = 1.15, 0.02
 SCORED_GAUSSIANS, MIN_SCORED_GAUSSIANS = 6000, 60  # Gaussians of a score: in all views, and at least in each view
 MAX_CHECKED = 5_000  # pixels per view that an alignment is checked on

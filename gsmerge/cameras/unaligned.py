@@ -26,11 +26,12 @@ RANDOM_SHARE = 0.85
 _COLOR_MARGIN, _MARGIN = 1.3, 2.0
 _FRAME_GAIN = 1.1  # least score of another frame, divided by the score of the cameras as they are
 _SEEN_GAUSSIANS = 20_000  # number of Gaussians that are projected, to estimate the share that cameras see
-# Gaussians that are compared in other conventions and frames. With this many Gaussians, scores have an error of 0.4 %,
-# while the scores of two frames have to differ by 5 % or more
+# Number of Gaussians whose colours are compared in other conventions and frames. It gives scores an error of 0.4 %,
+# which is small, as the scores of two frames have to differ by 5 % or more
 _COMPARED_GAUSSIANS = 5000
 MAX_FRONT_RATIO = 0.5  # like RANDOM_SHARE, but only for the foremost Gaussians, in a frame that was chosen by colours
-# A Gaussian is foremost up to _FRONT times the least depth in its cell. A cell has _PER_CELL Gaussians on average
+# A Gaussian counts as foremost if its depth is at most _FRONT times the least depth in its cell. A cell has _PER_CELL
+# Gaussians on average
 _FRONT, _PER_CELL = 1.05, 3
 # Scales of the cameras' positions, all of which are tried. Programs that write cameras and Gaussians use units that
 # differ by factors of up to 1000
@@ -39,7 +40,7 @@ _SCALES = np.geomspace(1 / 1300, 1300, 115)
 _FINER = ((0.1, 11, 2000), (0.015, 7, 20_000), (0.004, 5, 20_000))
 # Places in a picture at which the middle of the Gaussians is tried, to find a shift. A place is x in widths of the
 # picture, y in heights, and the logarithm of the depth in radii of the scene. The places are a tenth of a picture
-# apart, because colours still agree over this distance
+# apart, because colours still agree if the shift is wrong by this much
 _PLACES = tuple(np.linspace(*ends).tolist() for ends in ((-0.2, 1.2, 15), (-0.2, 1.2, 15), (-1.5, 2.25, 16)))
 # For each finer search around the best places: number of Gaussians, number of places that are kept, size of a step
 _SHIFT_STEPS = [(2000 if i < 5 else 20_000, 8 if i < 5 else 1, 0.05 * 0.6**i) for i in range(10)]
@@ -215,7 +216,7 @@ def choose_cameras(
         return PlacedGrid(grid, frame, "photos' colours"), []
     if not check.ok:
         remedy = f"{no_pixels.remedy}, or write their shift (x y z) to offset.txt beside the file"
-        if check.share_seen > 0.5:  # most Gaussians are in view, so only the colours contradict the cameras
+        if check.share_seen > 0.5:  # the views see most Gaussians, so only the colours contradict the cameras
             remedy += "; if the cameras are right, the photos or the colours of the file are wrong: --images none keeps"
             remedy += " the cameras, and --hint colors=rgb reads f_dc as RGB"
         raise SceneError(no_pixels.path, f"{no_pixels.problem}; {check.description}", remedy)
@@ -305,9 +306,9 @@ def _scale_frame(frame: Similarity, factor: float) -> Similarity:
 def _solve_scale(inputs: AlignmentInput, frame: Similarity) -> Similarity:
     """Return a frame at the scale at which its colours fit the photos best.
 
-    All scales of _SCALES are tried. Finer searches begin at the scale whose score stands out most from the scores of
-    scales two steps away. The score that stands out most need not be the highest: far from the true scale all cameras
-    may be in one place, so that scores are high, but equal.
+    All scales of _SCALES are tried. Finer searches begin at the scale whose score exceeds the scores two steps away by
+    most. This score need not be the highest: far from the true scale all cameras may be in one place, so that scores
+    are high, but equal.
     """
     scaled = [_scale_frame(frame, float(scale)) for scale in _SCALES]
     scale_gaussians = 2000  # Gaussians that the scales are tried on
@@ -350,7 +351,7 @@ def _solve_shift(inputs: AlignmentInput) -> list[Similarity]:
     places = sorted(product(*_PLACES), key=lambda place: -score(place, first_samples))
     best: list[tuple[float, ...]] = places[:first_places]
     for samples, count, step in _SHIFT_STEPS:
-        # tried are each place, and the places one step along each axis in both directions
+        # each place is tried, and so are the places one step away along each axis
         offsets = step * np.concatenate([np.zeros((1, 3)), np.diag((1, 1, 2.5)), -np.diag((1, 1, 2.5))])
         around = {tuple((place + offset).tolist()) for place in best for offset in offsets}
         best = sorted(sorted(around), key=lambda place: -score(place, samples))[:count]

@@ -3,10 +3,9 @@
 The exporter subtracts the median, divides by the 95 % quantile of the widest axis and rotates the world upright from
 the first camera. No file stores median, quantile or rotation. Often the rows alone do not determine their cameras:
 views may be fused (FreeSplat), layers of a pixel may have gaps, or so many far pixels may be cut that no lines repeat.
-But the file is recognised by a median of 0 and a quantile of 1, which show the rotation that was used. Scale and shift
-are solved for from rows whose pixels are found by colours. A stretch of rows without a gap has the colours of a stretch
-of pixels of a photo. Stretches of rows whose matches agree on one frame are matched right, and all other matches are
-wrong.
+A median of 0 and a quantile of 1 identify the exporter's files, and show which rotation it used. Scale and shift follow
+from rows whose pixels are found by colours. A stretch of rows without a gap has the colours of a stretch of pixels in a
+photo. Matches between such stretches are right if they agree on one frame, and wrong otherwise.
 """
 
 from __future__ import annotations
@@ -90,8 +89,7 @@ def solve_upright(inputs: AlignmentInput, rotation: Similarity, path: str) -> Si
 def _possible_orders(count: int, cameras: Cameras) -> Iterator[tuple[np.ndarray, list[_Stretch]]]:
     """Yield the orders that ``count`` rows may have.
 
-    An order is the pixels ``[p]`` of a photo that have rows, and the stretches of rows that are searched among these
-    pixels.
+    Each order is a pair: the pixels ``[p]`` of a photo that have rows, and the stretches of rows to search for in them.
     """
     # exporters that write interleaved rows cut off a border
     grid, trim = np.arange(cameras.width * cameras.height).reshape(cameras.height, cameras.width), TRIMS[0]
@@ -125,7 +123,7 @@ def _interleaved_stretches(count: int, views: int, per_pixel: int, num_pixels: i
 
 
 def _fused_stretches(count: int, views: int, num_pixels: int) -> list[_Stretch]:
-    """List stretches of rows of the first and of the last view, for views of ``num_pixels`` that were fused in order.
+    """List stretches of rows of the first and the last view, if views of ``num_pixels`` pixels were fused in order.
 
     ``count`` is the number of all rows. The rows of the first view come first, and the rows of the last view last. The
     list is empty for too few or too many rows.

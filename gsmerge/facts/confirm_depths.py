@@ -1,10 +1,9 @@
 """Scene with pixels -> the share of its depth that other views confirm, which predicts whether a fit can succeed.
 
-Each pixel's Gaussian is projected into the other views. The Gaussian that another view shows in front at this place is
-projected back into the first view. If this Gaussian lands near the pixel, at about the same depth, the other view
-confirms the pixel. A pixel is contradicted if more views see through its surface than confirm it, and alone if its
-position is outside of all other views. A pixel does not count if other views have no Gaussian at its position, for
-example beyond a crop.
+Each pixel's Gaussian is projected into the other views. The Gaussian in front there is projected back into the first
+view. If it lands near the pixel, at about the same depth, the other view confirms the pixel. A pixel is contradicted if
+more views see through its surface than confirm it, and alone if its position is outside of all other views. A pixel
+does not count if other views have no Gaussian at its position, for example beyond a crop.
 """
 
 from __future__ import annotations
@@ -24,24 +23,24 @@ from gsmerge.types import Cameras, Scene
 
 CONFIRM_PIXELS = 1200  # sampled pixels of a view
 CONFIRM_NEIGHBORS = 16  # nearest other views in which the sampled pixels are looked up
-# Largest distance from a pixel at which its point, projected back, agrees with it: AGREEMENT_SHARE as a share of the
-# longer side, but at least AGREEMENT_PIXELS
+# A point that is projected back agrees with its pixel up to a distance: the share AGREEMENT_SHARE of the longer side,
+# but at least AGREEMENT_PIXELS
 AGREEMENT_SHARE, AGREEMENT_PIXELS = 1 / 120, 1.5
 SAME_LOG_DEPTH = 0.05  # difference of the logarithms of two depths of one surface
 LEAST_DEPTH = 1e-9  # least depth, canonical units
 # A result is expected to be poor if the share of confirmed pixels is below POOR_SHARE. POOR_SHARE separates the poor
-# results of 15 captures from the sound results. If the share of alone pixels is above LONELY_SHARE, a poor result is
-# blamed on too few views
+# results of 15 captures from the sound results. If the share of pixels that no other view sees is above LONELY_SHARE, a
+# poor result is blamed on too few views
 POOR_SHARE, LONELY_SHARE = 0.5, 0.2
 # Chance may change a share by CHANCE_ERRORS standard errors. Fewer samples than NORMAL_SAMPLES decide nothing
 CHANCE_ERRORS, NORMAL_SAMPLES = 2.0, 30
-# Parts of pictures, as ranges of columns and of rows in thirds. A part is poor if more than the share POOR_PART_SHARE
-# of its pixels is contradicted, or alone
+# Parts of pictures, as ranges of columns and of rows in thirds. A part is poor if the share of its pixels that other
+# views contradict, or the share that no other view sees, is above POOR_PART_SHARE
 THIRDS = {
     "left third": ((0, 1), (0, 3)), "right third": ((2, 3), (0, 3)), "upper third": ((0, 3), (0, 1)),
     "lower third": ((0, 3), (2, 3)), "middle": ((1, 2), (1, 2)),
 }  # fmt: skip
-POOR_PART_SHARE = 0.5  # share of the pixels of a part, above which the part is poor
+POOR_PART_SHARE = 0.5  # share of a part's pixels
 # The useful number of Gaussians per pixel is MOST_PER_PIXEL if at least SOUND_SHARE of the pixels are confirmed, and
 # FEWEST, the usual number, if at most WRONG_SHARE are confirmed. With more Gaussians than are useful, a fit memorises
 # the photos (docs/guide/how-many.md). With MOST_PER_PIXEL instead of FEWEST, captures whose depth was confirmed lost at
@@ -59,7 +58,7 @@ class Agreement:
     num_pixels: int = field(default=CONFIRM_PIXELS, compare=False)  # Number of sampled pixels that count
     # Part of the pictures in which most pixels are contradicted, such as "left third of 4 of 7 views"; empty for none
     contradicted_part: str = field(default="", compare=False)
-    alone_part: str = field(default="", compare=False)  # Part in which most pixels are alone
+    alone_part: str = field(default="", compare=False)  # Part whose pixels other views mostly do not see
     # True if the cameras are so close together that no two views show things displaced by ``AGREEMENT_PIXELS``
     from_one_point: bool = field(default=False, compare=False)
 
@@ -96,8 +95,8 @@ class Agreement:
 def confirm_depths(scene: Scene) -> Agreement | None:
     """Measure the shares of depth that the views of a scene confirm, contradict, or do not see.
 
-    Returns None with fewer than two views, or if no pixel counts. Returns None also if views have no Gaussians of their
-    own, because a Gaussian that several views share would confirm itself.
+    Returns None with fewer than two views, or if no pixel counts. Returns None also if views share Gaussians, because a
+    shared Gaussian would confirm itself.
     """
     pixels = scene.pixels
     if len(scene) < 2 or pixels is None or not pixels.own or not pixels.shown.any():
@@ -155,7 +154,7 @@ def _look_up_pixels(scene: Scene, view: int, rows: np.ndarray) -> tuple[np.ndarr
     surface = means.take(front[has_front], 0).astype(np.float64)  # the points that the neighbours show at these pixels
     distance = _distance_back(surface, rows[ids], cameras[[view]])
     surface_depths = camera_depths(surface, cameras.viewmats[neighbors[neighbor_ids]])
-    # how far the point is behind the neighbour's surface (above 0), or in front of this surface (below 0)
+    # distance of the point behind the neighbour's surface; negative in front of the surface
     log_depths = log(depths[neighbor_ids, ids] / np.maximum(surface_depths, LEAST_DEPTH))
     agrees = (distance < 1) & (np.abs(log_depths) < SAME_LOG_DEPTH)
     sees_through = ~agrees & ((log_depths < -2 * SAME_LOG_DEPTH) | ((log_depths < 0) & (distance > 2)))

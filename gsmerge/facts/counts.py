@@ -142,9 +142,8 @@ def count_limits(
 def superpixels_per_view(scene: SceneSize, segment: SegmentOptions) -> int:
     """Return the number of superpixels per view.
 
-    If the option ``superpixels`` is a share, this is a share of the pixels. If views have no Gaussians of their own,
-    and if there are fewer Gaussians than pixels, the option is a share of the Gaussians. Scenes of few Gaussians
-    (:data:`FEW`) get more superpixels than this share.
+    A share in the option ``superpixels`` is a share of the pixels, or of the Gaussians if views share Gaussians and
+    there are fewer Gaussians than pixels. Scenes of few Gaussians (:data:`FEW`) get more superpixels.
     """
     per_view = count_for(segment, scene.height, scene.width)
     if scene.has_own_pixels or segment.per_view is not None:
@@ -156,7 +155,7 @@ def superpixels_per_view(scene: SceneSize, segment: SegmentOptions) -> int:
 
 
 def has_few_rows(scene: SceneSize) -> bool:
-    """Return whether Gaussians without pixels, such as tokens, are too few for a share of them to show the photos."""
+    """Return whether Gaussians that belong to no pixels are so few that a share of them could not show the photos."""
     has_photos = not scene.rendered and not scene.has_own_pixels
     return has_photos and scene.num_gaussians < FEW * _few_pixels(scene)
 

@@ -1,8 +1,7 @@
 """Scene -> the scene with drawings of its Gaussians outside of all views.
 
 A fit to photos alone loses the Gaussians that no photo shows. To keep these Gaussians, pictures of the input that show
-them are added as photos. If a scene lacks the camera of a photo, its result then lacks only what this photo would have
-added.
+them are added as photos. So Gaussians that only one photo shows stay even if the scene lacks the camera of this photo.
 """
 
 from __future__ import annotations
@@ -26,20 +25,19 @@ from gsmerge.types import Cameras, Gaussians, LargePhotos, PicturedScene, Pixels
 
 # Cameras are placed if views miss at least this share of the Gaussians. A placed camera is used if at least this share
 # of its pixels shows mainly Gaussians that the views miss. In fifteen captures in voxels, at most .001 of the Gaussians
-# are outside of all views. If a narrow capture keeps two of its four views, they miss .02 of the Gaussians; two of the
-# five views of another capture miss .006 of them
+# are outside of all views. Two of the four views of a narrow capture miss .02 of its Gaussians, and two of the five
+# views of another capture miss .006
 LEAST_OUTSIDE = 0.005
 SOURCES, STEPS_BACK = 4, 8  # number of views beside which cameras are placed, and of steps back from each
-# Bounds of a step: way back as a share of the depth, rotation to the sides and rotation up or down in degrees
+# Bounds of a step: distance backwards as a share of the depth, rotation to the sides and rotation up or down in degrees
 BESIDE_LOW, BESIDE_HIGH = (0.2, -20.0, -15.0), (1.0, 20.0, 15.0)
 
 
 def draw_outside(scene: PicturedScene) -> PicturedScene:
     """Add pictures of the input from placed cameras, with a note, if the views miss a part of the Gaussians.
 
-    The placed cameras come last. Pixels of the placed cameras count only if they show mainly Gaussians that no view
-    sees. The scene is canonical, and its rows are not pixels. The scene is returned unchanged if its views miss too few
-    Gaussians.
+    The placed cameras come last. Their pixels count only if they show mainly Gaussians that no view sees. The scene is
+    canonical, and its rows belong to no pixels. The scene is returned unchanged if its views miss too few Gaussians.
     """
     outside = scene.get_pixels().homes < 0
     if outside.mean() < LEAST_OUTSIDE or outside.all():  # if all are outside, the cameras are wrong
@@ -73,12 +71,12 @@ def _place_beside(gaussians: Gaussians, outside: np.ndarray, cameras: Cameras) -
     sources = cameras[even_views(len(cameras), min(len(cameras), SOURCES))]
     back = outside_cameras(sample.means, sources, STEPS_BACK * len(sources), BESIDE_LOW, BESIDE_HIGH)
     candidates = concat_cameras(back, _turn_around(sources))
-    least_added = 0.2  # a further camera is placed if it adds more than this share of what those before it show
+    least_added = 0.2  # a further camera is placed if it adds more than this share to what earlier cameras show
     return candidates[choose_showing(sample, candidates, outside[::step], least_added)]
 
 
 def _turn_around(cameras: Cameras) -> Cameras:
-    """Return copies of cameras that are turned about their centres, all around in steps of half the field of view.
+    """Return copies of cameras, turned full circle about their centres in steps of half the field of view.
 
     At each step one copy looks straight ahead, one looks up by half the field, and one looks down.
     """
@@ -110,7 +108,7 @@ def _with_drawings(scene: PicturedScene, cameras: Cameras, counting: np.ndarray)
 
 
 def _with_pixels_of(scene: PicturedScene, cameras: Cameras) -> Pixels:
-    """Return the pixels of a scene with those of further ``cameras``; Gaussians that have a pixel keep it."""
+    """Return the pixels of a scene with those of further ``cameras``; Gaussians with a pixel in the scene keep it."""
     pixels, placed = scene.get_pixels(), find_pixels(make_scene(scene.gaussians, cameras))
     placed_homes = np.where(placed.homes < 0, -1, placed.homes + len(scene) * scene.pixels_per_view)
     homes = np.where(pixels.homes < 0, placed_homes, pixels.homes)

@@ -2,8 +2,8 @@
 
 Exporters drop borders, far regions and faint rows, and voxels have gaps. Each view is drawn from its own camera. Each
 empty pixel of the drawing gets a Gaussian with the colour of the picture. The new Gaussian gets the depth of the
-surface beside the pixel, or a depth beyond the view's farthest surface. Of these depths, the one is chosen at which the
-pictures of the nearest other views agree best.
+surface beside the pixel, or a depth beyond the view's farthest surface. The depth at which the pictures of the nearest
+other views agree best is chosen.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from gsmerge.types import Cameras, Gaussians, PicturedScene, fill_pixels
 # The numbers from HOLE_OPACITY to BARE were chosen on exports of eight captures as Depth Anything 3 writes them, and on
 # the same exports with shuffled and with merged rows
 HOLE_OPACITY = 0.75  # opacity of the drawing below which a pixel is empty
-# Shares of the usual opacity of a view, which is low if the export has few rows. A pixel shows nothing if its opacity
-# is below the share NOTHING. A pixel is in an empty part if it shows nothing, and if the mean opacity around it is
-# below the share SPARSE
+# NOTHING and SPARSE are shares of the usual opacity of a view, which is low if the export has few rows. A pixel shows
+# nothing if its opacity is below the share NOTHING. A pixel is in an empty part if it shows nothing, and if the mean
+# opacity around it is below the share SPARSE
 NOTHING, SPARSE = 0.5, 0.25
 # A part of a picture stays empty if a square with the side LARGE_SIDE, a share of the picture's longer side, fits into
 # the part. All squares that fit must together cover at least the share LARGE_AREA of the picture. A rim of RIM_PIXELS
@@ -45,7 +45,7 @@ FARTHEST_QUANTILE = 0.99  # quantile of the depths that counts as the farthest
 HOLE_NEIGHBORS = 3  # number of nearest views that a picture is compared with
 DIFFERENCE_BLUR = 3.0  # standard deviation in pixels of the window over which differences are averaged
 NEW_SIZE_PIXELS, NEW_OPACITY = 0.75, 0.9  # standard deviation in pixels, and opacity, of a new Gaussian
-BARE = 0.02  # opacity up to which a pixel's own Gaussian shows nothing
+BARE = 0.02  # opacity up to which the Gaussian of a pixel shows nothing
 
 
 def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = False) -> PicturedScene:
@@ -58,7 +58,7 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = Fa
     Notes say what was filled and what stays empty.
     """
     fronts, is_cropped = scene.get_pixels().fronts, scene.region is not None
-    fillable = shown & (fronts < 0)  # pixels with a picture and without a Gaussian of their own
+    fillable = shown & (fronts < 0)  # pixels with a picture and without a Gaussian
     bare = (fronts < 0) | (scene.gaussians.opacities[fronts] <= BARE)  # pixels that seem to show nothing
     views = [
         view
@@ -71,7 +71,7 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = Fa
     gap = 2 * round(GAP_WIDTH * max(shown.shape[1:]) / 2) + 1
 
     def find_holes(view: int, tiled: TiledView) -> None:
-        """Find the pixels of a view that stay empty, that are bare in its drawing, and that are holes to fill."""
+        """Mark a view's pixels that stay empty, other pixels that its drawing does not cover, and holes to fill."""
         depths, transmittance = blend_depths(tiled)
         covered = transmittance <= 1 - HOLE_OPACITY
         if is_cropped or not everywhere:
@@ -158,7 +158,7 @@ def large_parts(empty: np.ndarray) -> np.ndarray:
 def _leave_empty(scene: PicturedScene, empty: np.ndarray) -> PicturedScene:
     """Return a scene whose pictures are black, and do not count in scores, at pixels that stay ``empty [v,h,w]``.
 
-    A note says at which share of the pixels photos no longer count.
+    A note says what share of the pixels no longer counts.
     """
     if not empty.any() or empty.all():
         return scene
@@ -221,7 +221,7 @@ def _choose_depths(
     neighbor_rays = [_rays_in(scene.cameras, neighbor, centres[view], rays) for neighbor in neighbors]
     colors, pixels = scene.images[view][holes], np.flatnonzero(holes)
     best_depths, best_costs = depths[0], np.full(len(rays), np.inf, np.float32)
-    min_gain = 0.001  # least gain in the difference of colours (sRGB) for each step to a farther depth
+    min_gain = 0.001  # decrease in the difference of colours (sRGB) that each step to a farther depth has to bring
     min_weight = 1e-3  # least weight, in the window of DIFFERENCE_BLUR, of pixels that other views see
     for step, depth in enumerate(depths):
         sums = np.zeros((*holes.shape, 2), np.float32)  # sums of differences, and numbers of differences

@@ -39,15 +39,15 @@ from gsmerge.types import PicturedScene
 SIDES = (60, 120, 240)  # longer side of the photos in pixels, one size after the other
 BORDER = 2  # width in pixels of the border that is not compared
 POSE_PIXELS = 1500  # compared pixels of a view, those with the largest gradients
-# At the first size, at which right poses are recognised: compared pixels of a view, and largest number of steps. The
-# check has few pixels and steps, because it takes time in scenes with right poses, too
+# Compared pixels of a view, and largest number of steps, at the smallest size of the photos. Scenes with right poses
+# get no further steps, so few pixels and steps save time
 FIRST_PIXELS, FIRST_STEPS = 600, 2
 POSE_NEIGHBOURS = 4  # number of other views with which a view is compared
 POSE_STEPS = 6  # largest number of Gauss-Newton steps at each size
 TOGETHER = 16  # pairs of views that one task compares
 POSE_BLUR = 0.7  # blur of the photos, standard deviation in pixels
-# Detail of photos is finer than the blur DETAIL, in pixels. Highlights are smooth. If new poses follow highlights, the
-# detail of surfaces agrees less than with the old poses. New poses are dropped if detail agrees less by more than
+# Detail of photos is finer than the blur DETAIL, in pixels. Highlights are smooth. If highlights mislead the new poses,
+# the detail of surfaces agrees less than with the old poses. New poses are dropped if detail agrees less by more than
 # CHANCE standard errors
 DETAIL, CHANCE = 2.0, 2.0
 # Errors of poses are assumed to have the standard deviations PRIOR_TURN in radians and PRIOR_SHIFT in canonical units.
@@ -58,8 +58,8 @@ PRIOR_TURN, PRIOR_SHIFT, PRIOR = 0.026, 0.03, 30.0
 # the gain of all views together above MEAN_GAIN. Right poses have gains, too, if the depth is wrong. At the largest
 # size, gains of right poses are up to 0.14 for a view and 0.06 for all views together. Poses of a depth camera have
 # gains up to 0.28 for a view and 0.18 for all. If all poses are wrong by half a degree, the gain of all views is at
-# least 0.22. If a single pose is wrong, the gain of its view is 0.32 (14 captures). In doubt the poses are not moved,
-# because photos outside the scene have poses in the same frame as the input
+# least 0.22. If a single pose is wrong, the gain of its view is 0.32 (measured on 14 captures). In doubt the poses are
+# not moved, because photos outside the scene have poses in the same frame as the input
 LEAST_GAIN, VIEW_GAIN, MEAN_GAIN = 0.1, 0.3, 0.2
 
 
@@ -80,10 +80,10 @@ class _PhotoLevel:
 
 @dataclass(frozen=True, eq=False)
 class _Evidence:
-    """Evidence from the pixels of the first view of each of p pairs about the relative pose of both views."""
+    """Evidence about the relative poses of p pairs of views, from the pixels of each pair's first view."""
 
-    # Curvature and slope of half the squared differences of greys, by a motion of the second view. The same motion of
-    # the first view changes the differences the other way, because only the relative pose counts
+    # Curvature and slope of half the squared differences of greys, by a motion of the second view. Only the relative
+    # pose counts, so the same motion of the first view changes the differences the other way
     curvatures: np.ndarray  # [p,6,6]
     slopes: np.ndarray  # [p,6]
     costs: np.ndarray  # [p] mean disagreement of the pixels
@@ -94,9 +94,9 @@ def move_poses(scene: PicturedScene, views: Sequence[int], *, always: bool = Fal
     """Move every camera, with the Gaussians of its pixels, so that the photos agree with each other.
 
     Only ``views``, whose photos show the scene, are moved. With ``always``, the cameras are moved even if the photos
-    hardly gain. The median motion of the views is subtracted from all motions, so that the scene as a whole stays in
-    place. Returns None if no pose is wrong, if the photos are too small or do not overlap, or if the detail of the
-    photos agrees less after the move.
+    then hardly agree better. The median motion of the views is subtracted from all motions, so that the scene as a
+    whole stays in place. Returns None if no pose is wrong, if the photos are too small or do not overlap, or if the
+    detail of the photos agrees less after the move.
     """
     start = scene.cameras.viewmats.astype(np.float64)
     largest, shortest = (f(scene.cameras.width, scene.cameras.height) for f in (max, min))
@@ -196,8 +196,8 @@ def _expect_greys(
     """Return the greys ``[p,m]`` that the second view of each pair should show at the sampled points of the first.
 
     The expected greys are the ``greys`` of the first view, plus the change of colour of the Gaussians ``rows`` from the
-    first view to the second. Without this change a highlight, which moves over its surface with the camera, would look
-    like a wrong pose.
+    first view to the second. Without this change, a highlight would look like a wrong pose, because it moves over its
+    surface with the camera.
     """
     g, eyes = scene.gaussians, scene.cameras.centres.astype(np.float32)
     expected = np.zeros((len(pairs), max(map(len, greys))), np.float32)

@@ -1,12 +1,12 @@
 """Scene -> the pixel of each Gaussian and the Gaussian in front of each pixel; also raise sizes far below a pixel.
 
 Pixels are found by projection of centres. Each view is divided into cells that are wider than the distances between
-neighbouring Gaussians. The front of a cell is the Gaussian that its pixels show most. Gaussians behind the front are
-hidden. A pixel that contains no centre shows the front of its cell.
+neighbouring Gaussians. The Gaussian that a cell's pixels show most is the cell's front, and hides the Gaussians behind
+it. A pixel that contains no centre shows the front of its cell.
 
 A renderer widens every Gaussian by the low-pass filter of the pixels. Because of this filter, Gaussians that are far
-smaller than a pixel, such as points that all got one tiny size, look sound. But functions that use the sizes of such
-tiny Gaussians without rendering would find an empty scene.
+smaller than a pixel, such as points that all got one tiny size, look right when rendered. But functions that use these
+tiny sizes without rendering would find an empty scene.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ from gsmerge.runtime.threads import in_turn
 from gsmerge.types import Pixels, Scene, SceneT
 
 # Cells are wide enough if at least this share of them has a centre. Only cells whose neighbours all have a centre are
-# examined. Of eight captures in voxels, six have shares of at least .97, and the same result as with rendering. The two
-# captures with shares of .93 and .95 lose 1.5 and 5 dB
+# examined. Of eight captures in voxels, six have shares of at least .97, and lose nothing compared with finding fronts
+# by rendering. The two with shares of .93 and .95 lose 1.5 and 5 dB
 COVERED_CELLS = 0.96
 SHOWN_WIDTH = 4.0  # width of a Gaussian that shows nearly all of it, in standard deviations
 ESTIMATE_GAUSSIANS = 10_000  # medians and shares are estimated from at least this many Gaussians, if there are as many
 SAME_DEPTH = 1.05  # a centre is on the surface of its cell up to this multiple of the depth of the cell's front
 LOW_PASS = math.sqrt(EPS2D)  # standard deviation of the low-pass, pixels
 # The low-pass hides a Gaussian whose scales are all below the share HIDDEN_SIZE of the low-pass. If at most the share
-# FEWEST_HIDDEN of the Gaussians is hidden, nothing changes, because a fit repairs such a small share. In placed views
-# of sound scenes up to .05 of the Gaussians are hidden
+# FEWEST_HIDDEN of the Gaussians is hidden, nothing changes, because a fit repairs such a small share. In sound scenes
+# seen from placed cameras, the low-pass hides up to .05 of the Gaussians
 HIDDEN_SIZE, FEWEST_HIDDEN = 0.5, 0.1
 
 
@@ -49,9 +49,9 @@ def with_pixels(scene: SceneT) -> SceneT:
 def raise_sizes(scene: SceneT, *, placed: bool = False) -> SceneT:
     """Return a canonical scene in which Gaussians that the low-pass hides have the size of the low-pass, with a note.
 
-    Gaussians that share a pixel may be smaller than it, because each shows a part of the pixel. If they counted as
-    hidden, sound scenes in views with few pixels would change. If the cameras were ``placed``, sizes are compared with
-    the distance to the nearest Gaussian instead of a pixel.
+    Gaussians that share a pixel may be smaller than it, because each shows a part of the pixel. They do not count as
+    hidden, because otherwise sound scenes with few pixels would change. If the cameras were ``placed``, sizes are
+    compared with the distance to the nearest Gaussian instead of a pixel.
     """
     g, cameras, by_distance = scene.gaussians, scene.cameras, placed and len(scene.gaussians) > 1
     homes = np.full(len(g), -1) if scene.pixels is None else scene.pixels.homes
@@ -64,7 +64,7 @@ def raise_sizes(scene: SceneT, *, placed: bool = False) -> SceneT:
     units = find_nearest(g.means, 1)[1][:, 0] if by_distance else measure_pixel_sizes(g.means, homes, cameras)
     sizes, seen = g.scales.max(1), (homes >= 0) | by_distance
     num_sharing = 1 if by_distance else np.where(seen, np.bincount(homes + 1)[homes + 1], 1)
-    is_near = units < 1  # a pixel that is as large as the scene's median depth, or larger, is no measure of sizes
+    is_near = units < 1  # sizes are not compared with pixels as large as the scene's median depth, or larger
     hidden = (sizes * np.sqrt(num_sharing) < HIDDEN_SIZE * LOW_PASS * units) & is_near
     if np.count_nonzero(hidden & seen) <= FEWEST_HIDDEN * np.count_nonzero(seen):
         return scene

@@ -29,8 +29,8 @@ FAR_RADII, NEAR_RADII = 2.0, 1.2  # distances of cameras around the scene, in it
 INSIDE = (0.0, -0.5, 0.5)  # positions of cameras inside, along each axis, as a share of half the extent
 INSIDE_DIRECTIONS = 8  # directions in which cameras look from each position inside
 FIELD = 1.0  # width of the image, divided by the focal length
-# Field of cameras at a viewer's place, as FIELD (80 degrees), and size of their pixels in standard deviations of
-# Gaussians
+# Cameras at a viewer's place: width of the image divided by the focal length (80 degrees), and size of a pixel in
+# standard deviations of Gaussians
 INSIDE_FIELD, INSIDE_PIXEL = 5 / 3, 1.5
 PROBE = 96  # pixels per side of the pictures for choosing candidates
 SMALLEST_PIXELS, LARGEST_PIXELS = 96, 640  # pixels per side
@@ -41,7 +41,7 @@ WIDEST = np.pi / 4  # the space between two views is unknown if the angle betwee
 # A fit to renders of at most this many views also gets renders between them, because it would memorise so few views
 FEW_RENDERED_VIEWS = 24
 OUTSIDE_SHARE, MOST_OUTSIDE = 0.5, 24  # number of views from outside as a share of all views, and its maximum
-# Bounds of views from outside: step back as a share of the depth, rotation to the sides and rotation up or down in
+# Bounds of views from outside: step backwards as a share of the depth, rotation to the sides and rotation up or down in
 # degrees
 OUTSIDE_LOW, OUTSIDE_HIGH = (0.0, -15.0, -10.0), (0.6, 15.0, 10.0)
 
@@ -213,7 +213,7 @@ def place_cameras(gaussians: Gaussians, num_views: int = NUM_VIEWS) -> Cameras:
     viewmats = _candidate_viewmats(centre, half)
     candidates = Cameras(viewmats, np.repeat(_square_intrinsics(PROBE)[None], len(viewmats), 0), PROBE, PROBE)
     shares = _shares_seen(sample, candidates, NEAR_PLANE_SHARE * float(np.sqrt((half * half).sum())))
-    least_gain = 1e-3  # a camera is added if it raises the opacity that all chosen cameras show by more than this share
+    least_gain = 1e-3  # a camera is added if it raises the shown opacity by more than this share
     best = _choose_candidates(shares, num_views, least_gain)
     size = int(np.clip(round(math.sqrt(len(gaussians))), SMALLEST_PIXELS, LARGEST_PIXELS))
     return Cameras(viewmats[best], np.repeat(_square_intrinsics(size)[None], len(best), 0), size, size)
@@ -295,8 +295,7 @@ def _look_along(eye: np.ndarray, direction: np.ndarray) -> np.ndarray:
 def choose_showing(sample: Gaussians, candidates: Cameras, counting: np.ndarray, least_added: float) -> list[int]:
     """Choose candidates that show as much as possible of the Gaussians in the mask ``counting [n]`` of a sample.
 
-    A further candidate must add more than the share ``least_added`` to the opacity that the chosen candidates show. The
-    sample is canonical.
+    Each candidate must add more than the share ``least_added`` to the opacity shown so far. The sample is canonical.
     """
     shares = _shares_seen(sample, resize_cameras(candidates, PROBE, PROBE), NEAR_PLANE)
     return _choose_candidates(shares[:, counting], NUM_VIEWS, least_added)
@@ -319,7 +318,7 @@ def _shares_seen(sample: Gaussians, candidates: Cameras, near: float) -> np.ndar
 
 
 def _choose_candidates(shares: np.ndarray, num_views: int, least_added: float) -> list[int]:
-    """Choose one to ``num_views`` candidates, each of which adds most to the opacity that the chosen ones already show.
+    """Choose one to ``num_views`` candidates, always the one that adds most to the opacity shown so far.
 
     ``shares [c,n]`` is the result of :func:`_shares_seen`. The choice ends when no other candidate would add more than
     the share ``least_added``.

@@ -42,7 +42,7 @@ class Reference:
 
     name: str  # "photos", or the name of the pictures that replace them
     score_views: tuple[int, ...]  # Views whose pictures results are scored on
-    # True if the scene has no views of its own, so that all views are placed; no fit sees the views for scores
+    # True if the scene has no views, so that all views are placed; no fit sees the views for scores
     placed: bool = False
     # [v,h,w,3] unchanged photos of the input scene, if the run changed some of them
     photo_files: np.ndarray | None = field(default=None, compare=False, repr=False)
@@ -58,7 +58,7 @@ class Prepared:
     """A scene in its canonical frame, as the stages use it, with facts about it."""
 
     input_scene: Scene  # The scene as it was read, in its own world frame, with photos that look like its Gaussians
-    # The canonical scene with pixels. The scene has every view once, and photos that do not show it are replaced
+    # The canonical scene with pixels. It has every view once, and photos that do not show it are replaced
     scene: PicturedScene
     frame: Frame  # The canonical frame
     reference: Reference  # Use of the pictures
@@ -76,7 +76,7 @@ class Prepared:
 
     @cached_property
     def doubt(self) -> str | None:
-        """Why scores of the scene and of its results mean nothing, as one sentence; None if scores are meaningful."""
+        """Why scores of the scene and its results mean nothing, in one sentence; None if scores are meaningful."""
         unlike = unlike_captures(self.scene.gaussians[sample_rows(self.scene)])
         if unlike is not None:
             return unlike
@@ -122,9 +122,8 @@ def prepare(
 
     ``frame`` is the canonical frame; None stands for the scene's own frame. With ``fill``, Gaussians are added at
     pixels that only pictures show. With ``outside``, pictures of Gaussians that no view sees are drawn; it is False if
-    the views are a part of a larger scene, whose other views see these Gaussians. With ``pixels``, the pixels of placed
-    views are found, which superpixels need. Raises ValueError if there is no finite Gaussian, or if there are images
-    without cameras.
+    other views of a larger scene see these Gaussians. With ``pixels``, the pixels of placed views are found, which
+    superpixels need. Raises ValueError if there is no finite Gaussian, or if there are images without cameras.
     """
     options = options or PrepareOptions()
     input_scene, (scene, repeated, notes) = scene, without_repeats(scene)
@@ -188,9 +187,9 @@ def _prepare_pictures(
 ) -> Prepared:
     """Choose the pictures to which results are fitted, and return the prepared scene.
 
-    Photos that show the scene are used first. If no photo shows the scene, the colours of the views' own Gaussians are
-    used. If the views have no Gaussians of their own either, renders of the scene are used. Views with Gaussians of
-    their own and photos also get one exposure, and poses at which the photos agree.
+    Photos that show the scene are used first. If no photo shows the scene, a view's picture has the colours of its
+    Gaussians, or if views share Gaussians, it is a render. Scenes with photos, in which each Gaussian belongs to one
+    view, also get one exposure, and poses at which the photos agree.
     """
     has_own, has_photos = canonical.has_own_pixels, canonical.images is not None
     stand_in = partial(add_row_colors, has_photos=has_photos) if has_own else blank_pictures
@@ -280,8 +279,8 @@ def views_notes(scene: Scene) -> list[str]:
 def scored_pictures(scene: Scene) -> tuple[Scene, bool]:
     """Return a scene with its pictures for scores, and whether :func:`prepare` would change these pictures.
 
-    The pictures are the photos. If photos are missing, have another look, or do not show the scene, and if views have
-    Gaussians of their own, the pictures have the colours of these Gaussians.
+    The pictures are the photos. If photos are missing, have another look, or do not show the scene, and each Gaussian
+    belongs to one view, a view's picture has the colours of its Gaussians.
     """
     has_pictures = scene.has_own_pixels or scene.images is not None
     if len(scene) == 0 or len(scene.gaussians) == 0 or not has_pictures:

@@ -11,9 +11,9 @@ from gsmerge.geometry.transforms import median, quantiles
 from gsmerge.photos.views import camera_kinds
 from gsmerge.types import Gaussians, Scene
 
-# Bounds that the Gaussians of all captures keep. The median of the Gaussians' largest scales is at most LARGE_SCALE
-# times the diagonal of the box that holds most Gaussians. The median coefficient of the base colours is at most
-# BRIGHT_COLOR. The bounds are not tested on fewer than FEWEST_TESTED Gaussians
+# Limits that the Gaussians of every real capture keep. The median of the Gaussians' largest scales is at most
+# LARGE_SCALE times the diagonal of the box that holds most Gaussians. The median coefficient of the base colours is at
+# most BRIGHT_COLOR. The limits are not tested on fewer than FEWEST_TESTED Gaussians
 LARGE_SCALE, BRIGHT_COLOR, FEWEST_TESTED = 0.25, 10.0, 100
 FLAT_RANGE, FAINT_MEDIAN = 0.01, 1 / 255  # least range of the base colours' coefficients; least median opacity
 
@@ -26,8 +26,8 @@ class SceneSize:
     num_views: int
     height: int  # Pixels
     width: int
-    has_own_pixels: bool  # True if each view has Gaussians of its own
-    # True if views have neither photos nor Gaussians of their own, so that renders of the input are used as pictures
+    has_own_pixels: bool  # True if each Gaussian belongs to one view
+    # True if renders of the input stand in for photos, because there are no photos and views share the Gaussians
     rendered: bool
     num_cameras: int = 2  # Number of different cameras; 1: all views have the same camera
     sh_degree: int = 0
@@ -57,7 +57,7 @@ def measure_size(scene: Scene, rendered: bool | None = None) -> SceneSize:
 
 
 def unlike_captures(gaussians: Gaussians) -> str | None:
-    """Say in one sentence how finite Gaussians differ from those of all captures; None if they do not differ.
+    """Say in one sentence how finite Gaussians differ from those of real captures; None if they do not differ.
 
     The bounds are in docs/reference/conventions.md.
     """

@@ -1,7 +1,7 @@
 """Gaussians and cameras -> support: the number of views that show each Gaussian.
 
-Where no photo shows the scene, behind other surfaces and beyond the borders of the pictures, the Gaussians of a fit are
-guesses. Such guesses are invisible from the photos' cameras, but look like surfaces from farther away. The number of
+Behind other surfaces and beyond the borders of the photos, where no photo shows the scene, the Gaussians of a fit are
+guesses. The photos' cameras do not see these guesses, but from farther away they look like surfaces. The number of
 views tells guesses from other Gaussians, so that results can mark the guesses, leave them out, or show them faintly.
 """
 
@@ -24,8 +24,7 @@ SHOWN_WEIGHT = FitOptions().min_contribution
 def count_views(gaussians: Gaussians, cameras: Cameras) -> np.ndarray:
     """Count the views that show each of n canonical Gaussians, ``[n]`` int32.
 
-    A view shows a Gaussian if its blending weight is at least 1/255 in some pixel. A fit keeps no Gaussian with smaller
-    weights.
+    A view shows a Gaussian whose blending weight is at least 1/255 in some pixel. A fit keeps only such Gaussians.
     """
     splats = make_splats(gaussians)
     min_level = 2  # pictures are smaller by at least this factor, as in a fit's survey

@@ -17,13 +17,13 @@ from gsmerge.kernels.matrices import matmul, solve_symmetric
 from gsmerge.types import Gaussians
 
 GOLDEN = np.pi * (1 + math.sqrt(5))  # angle between successive directions that spreads them evenly
-ALIKE = 0.5  # the spread of the logarithms of angles, divided by that of the logarithms of sizes, has to be below this
+ALIKE = 0.5  # largest spread of the logarithms of angles, divided by the spread of the logarithms of sizes
 # A place is likely if its error is at most this multiple of the least error. If a scene is one plane, places on both
 # sides of it have equal errors. Of the likely places, the one with Gaussians in most directions is the viewer's
 LIKELY = 1.1
 CELLS = 100  # cells of directions, half of which the scene has to cover
-# The share NEAR_SHARE of the Gaussians is nearer to a viewer than some distance, of which the radius of the empty space
-# around the viewer is the share FREE
+# The radius of the empty space around a viewer is FREE times the distance within which the share NEAR_SHARE of the
+# Gaussians lies
 FREE, NEAR_SHARE = 0.25, 0.05
 
 
@@ -37,7 +37,7 @@ class Viewer:
 
 
 def find_viewer(gaussians: Gaussians) -> Viewer | None:
-    """Find the viewer around whom finite Gaussians were made.
+    """Find the place of the viewer for whom finite Gaussians were made, from their sizes.
 
     Returns None if sizes do not grow with the distance from any place, or if too many directions show nothing.
     """
@@ -71,8 +71,8 @@ def _solve_place(means: np.ndarray, sizes: np.ndarray, place: np.ndarray) -> tup
     """
     error = math.inf
     rounds = 8  # number of steps
-    doubt_factor = 2.0  # an error gets half the weight if it is this multiple of the median error
-    least_error = 1e-3  # added to the multiple of the median, so that weights are finite if half of the errors are 0
+    doubt_factor = 2.0  # errors of this multiple of the median error get half the weight
+    least_error = 1e-3  # added to this multiple, so that weights are finite if half of the errors are 0
     for _ in range(rounds):
         offsets = means - place
         distances = np.sqrt((offsets**2).sum(1)) + np.finfo(np.float32).tiny

@@ -52,11 +52,11 @@ def scene_members(scene: Scene) -> Members:
 
 
 def measure_pixel_sizes(means: np.ndarray, homes: np.ndarray, cameras: Cameras) -> np.ndarray:
-    """Measure the width ``[n]`` of a pixel at each of ``means [n,3]``, which is the smallest detail that a photo shows.
+    """Measure the width ``[n]`` of a pixel, the smallest detail that a photo shows, at each of ``means [n,3]``.
 
     ``homes [n]`` are the pixels of the means, numbered over all views; -1 for none. A width is in units of the world,
-    at the depth of the mean in the view of its pixel. For a mean without a pixel, the width is the smallest of the
-    widths in all views, at the distance of the mean from the camera.
+    at the depth of the mean in its pixel's view. For a mean without a pixel, the width is the smallest of the widths in
+    all views, at the distance of the mean from the camera.
     """
     widths, viewmats = np.empty(len(means), np.float32), cameras.viewmats.astype(np.float32)
     focals = np.array([float(np.sqrt(abs(K[0, 0] * K[1, 1]))) for K in cameras.Ks])
@@ -107,7 +107,7 @@ def pool_members(members: Members, starts: np.ndarray, ids: np.ndarray, rule: Ru
     """Pool every group of members into moments, weighted by opacity.
 
     ``ids [m]`` int32 are rows of ``members``, group after group. ``starts [g+1]`` int64 are the starts of the groups in
-    ``ids``. The ``rule`` ``"depth"`` adds the members' own covariances to the covariance of their means, and sums their
+    ``ids``. The ``rule`` ``"depth"`` adds the members' covariances to the covariance of their means, and sums their
     integrated optical depths. The rule ``"paper"`` is the paper's moment matching (eq. teacher_mean, teacher_cov). For
     the opacity, which the paper does not state, this rule takes the mean opacity of the members.
     """

@@ -284,7 +284,7 @@ def order_others(distances: np.ndarray) -> np.ndarray:
 def median(values: np.ndarray) -> float:
     """Return the median of all ``values``; NaN if there are no values, or if a value is NaN.
 
-    ``np.median`` is several times as slow.
+    The function is several times as fast as ``np.median``.
     """
     values = values.reshape(-1)
     if len(values) > FEW_VALUES and not np.isnan(values.min()):
@@ -317,7 +317,7 @@ def quantiles(values: np.ndarray, shares: Sequence[float]) -> np.ndarray:
     ordered = np.partition(values, [*before, *after], axis=0)
     low, high = ordered[before], ordered[after]
     steps = (places - before).reshape(-1, *[1] * (values.ndim - 1))
-    # like np.quantile, start from the nearer of two values, which decides how results are rounded
+    # start from the nearer of two values, so that results are rounded as by np.quantile
     return np.where(steps < 0.5, low + (high - low) * steps, high - (high - low) * (1 - steps))
 
 

@@ -53,7 +53,7 @@ _UNKNOWN_KEYS = (
     "camera_format", "rows", "alignment", "alignment_problem", "sight", "compact", "auto", "agreement", "num_unseen",
 )  # None unless the views are known  # fmt: skip
 _CAMERA_ELEMENTS = ("extrinsic", "intrinsic", "image_size")  # elements of a .ply that hold its camera
-_REPEATED = "read as: "  # beginning of notes that say the same as the line "rows"
+_REPEATED = "read as: "  # first words of notes that repeat the line "rows"
 _ENCODINGS = {"logit": "as logits", "raw": "in [0, 1]"}  # words for the encodings of opacities
 
 
@@ -224,8 +224,8 @@ def _describe_sight(scene: Scene) -> dict[str, Any]:
 def _count_unseen(load: Loaded) -> dict[str, Any]:
     """Count the Gaussians of a result that no view shows; {} if this number would mean nothing.
 
-    The number means nothing without views. It also means nothing if there is a Gaussian for each pixel, because
-    Gaussians of overlapping views hide each other.
+    The number means nothing without views, or if each pixel has a Gaussian, because Gaussians of overlapping views hide
+    each other.
     """
     if len(load.scene) == 0 or load.recovery is not None:
         return {}

@@ -7,8 +7,8 @@ replaced or left out
 - if it matches the view no better than photos match views that they do not show (wrong pairs), or
 - if its parts lie farther from their places than the parts of the other proposed photos do.
 
-For each view that is left without a photo, the photos with the highest scores are compared part by part. Parts tell
-neighbouring views apart, because photos of neighbours show the same things in different places.
+For each view that is left without a photo, the photos with the highest scores are compared part by part. This tells
+neighbouring views apart, because their photos show the same things in different places.
 """
 
 from __future__ import annotations
@@ -76,9 +76,8 @@ class _Scores:
     def choose_orientation(self, view: int, photo: int, tag: int) -> int:
         """Choose the orientation in which a photo shows a view.
 
-        The stored orientation, 0, is chosen if no other scores clearly higher. Next, ``tag`` is chosen if no other
-        orientation scores clearly higher than ``tag``. If neither the stored orientation nor ``tag`` is chosen, the
-        result is the orientation with the highest score.
+        The stored orientation, 0, is tried first, and ``tag`` next. Each is chosen if no other orientation scores
+        clearly higher. If neither is chosen, the result is the orientation with the highest score.
         """
         scores = np.nan_to_num(self.values[view, self.photos.index(photo)], nan=-np.inf)
         proposed = (orientation for orientation in (0, tag) if scores[orientation] > scores.max() - SIGNIFICANT)
@@ -170,8 +169,8 @@ class Assigner:
         Noisy Gaussians lower the scores of all photos and displace the parts of photos. The thresholds of rejection
         therefore follow from the scores and parts of the proposed photos themselves.
 
-        If names are ``exact``, a photo is confirmed if its score is high and no other assignment scores higher. A photo
-        that is not confirmed by its score is confirmed if its parts lie in their places.
+        If names are ``exact``, a photo is confirmed if its score is high and no other assignment scores higher. If the
+        score does not confirm a photo, the photo is confirmed if the parts of its view's picture lie in place in it.
         """
         out, confirmed = list[Assignment | None]([None] * len(named)), [False] * len(named)
         named_pairs = [(view, photo) for view, photo in enumerate(named) if photo is not None]
@@ -262,7 +261,7 @@ class Assigner:
         step, tag = -(-len(photos) // FIRST_PHOTOS), self.candidates.tag
         compared = set(range(0, len(photos), step))  # indices into ``photos``
         max_compared = 4  # number of photos that are compared with a view part by part
-        while True:  # until the best photos of all views have no neighbours that were not compared
+        while True:  # until all neighbours of the views' best photos are compared
             scores = self.score_in_views(photos[index] for index in sorted(compared))
             best = scores.best()
             columns = {view: np.argsort(-best[view], kind="stable")[:max_compared] for view in views}
@@ -295,8 +294,8 @@ def assign_photos(
         show: ``show(side)`` makes pictures of the views with ``side`` pixels on the longer side.
         candidates: The photos.
         named: The photo that names or order propose for each view, or None.
-        exact: The proposal is by names. If most names prove right, a view without a photo of its name gets no photo,
-            because all photos have names of other views.
+        exact: The proposal is by names. If most names prove right, a view gets no photo if no photo has its name,
+            because all photos have the names of other views.
         stored: The photos as stored in their files, if ``candidates`` are resampled to the views.
 
     Returns:

@@ -2,9 +2,9 @@
 
 A change exchanges red and blue, applies a tone curve to each channel, or is a linear map of colours. Pictures are cut
 into blocks, half of which are black and half white like the squares of a chess board. The change for the black blocks
-is fitted to the white blocks, and the other way round, so no block is scored by a change that was fitted to this block.
-A change is accepted if it reduces the errors of blocks by more than their noise and by more than half. The error of a
-block is the error of its mean colour, because wrong depth displaces few Gaussians across a block.
+is fitted to the white blocks, and the other way round, so no block scores a change that was fitted to this block. A
+change is accepted if it reduces the errors of blocks by more than their noise and by more than half. The error of a
+block is the error of its mean colour, because wrong depth moves few Gaussians into other blocks.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ def map_colors(matrix: np.ndarray, photo: np.ndarray) -> np.ndarray:
 
 
 def vary_in_hue(colors: np.ndarray, weights: np.ndarray) -> float:
-    """Measure what part of the colours ``[n,3]`` does not follow from their brightness, weighted by ``weights [n]``.
+    """Measure how far colours ``[n,3]``, with ``weights [n]``, are from colours that depend only on brightness.
 
     The result is the root mean square distance of the colours from the best tone curve of their grey levels. The result
     is about 0 for grey photos, and for photos of a single tint.
@@ -145,7 +145,7 @@ def map_blocks(blocks: Blocks) -> Blocks:
 
 
 def plain_blocks(blocks: Blocks) -> Blocks:
-    """Return the blocks with plain photos in the mean colour of the Gaussians, which is found by :func:`_cross_fit`."""
+    """Return the blocks with photos of one colour, the mean colour of the Gaussians that :func:`_cross_fit` finds."""
     plain = _cross_fit(blocks.photos, blocks.pictures, blocks.solid.astype(np.float32), _plain_change)
     return Blocks(plain, blocks.pictures, blocks.solid)
 
@@ -157,7 +157,7 @@ def _plain_change(_: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> Ch
 
 
 def _cross_fit(photos: np.ndarray, pictures: np.ndarray, weights: np.ndarray, fit: FitColors) -> np.ndarray:
-    """Change the black blocks of photos ``[v,h,w,3]`` as ``fit`` finds for the white blocks, and vice versa.
+    """Fit a change to the white blocks of photos ``[v,h,w,3]``, apply it to the black blocks, and vice versa.
 
     ``fit`` maps photos to ``pictures [v,h,w,3]``, with ``weights [v,h,w]``.
     """

@@ -1,8 +1,8 @@
 """Scene -> the scene with photos that look like its Gaussians, without photos that do not show it.
 
 Photos with another tone (linear light, exposure or gamma) are corrected by a curve for each channel. Photos that do not
-show their views are left out. All photos are left out if their colours have another look, such as red and blue in the
-wrong order. If a pixel of a photo still differs from the colour of its own Gaussian and from a drawing of its view's
+show their views are left out. All photos are left out if their colours have another look, such as exchanged red and
+blue. If a pixel of a photo still differs from the colour of its own Gaussian and from a drawing of its view's
 Gaussians, something covers the scene there, and the Gaussians' colours are used at this pixel.
 """
 
@@ -57,8 +57,8 @@ def compare_photos(scene: PicturedScene, look: Look = "auto") -> tuple[PicturedS
     """Correct the photos of a canonical scene, and replace photos, or parts of them, that do not show it.
 
     Returns the scene and the views whose photos show it. No view is returned if most photos do not show the scene, or
-    if the photos have another look, such as red and blue in the wrong order. With ``look`` "photos", all photos count
-    unchanged. With ``look`` "scene", no photo counts. The record gets notes and the choices ``photos_changed`` and
+    if the photos have another look, such as exchanged red and blue. With ``look`` "photos", all photos count unchanged.
+    With ``look`` "scene", no photo counts. The record gets notes and the choices ``photos_changed`` and
     ``photos_left_out``.
     """
     photo_views = scene.photo_views
@@ -100,9 +100,9 @@ def find_tones(pairs: Pairs, views: Sequence[int]) -> list[np.ndarray | None]:
     """Find, for each view, the tone curve ``[3,256]`` from its photo to its Gaussians; None if tones are equal.
 
     If the pictures of the Gaussians are drawings, all photos share a curve. If no photo changes by more than
-    :data:`EXPOSURE_STEP`, no curve counts, because models have a tone of their own. A curve counts only if the inverse
-    curve, from Gaussians to photos, reduces errors, too. The inverse curve reduces no errors if photos and Gaussians
-    differ by noise, which flattens the colours of Gaussians.
+    :data:`EXPOSURE_STEP`, no curve counts, because models themselves change tones slightly. A curve counts only if the
+    inverse curve, from Gaussians to photos, reduces errors, too. The inverse curve reduces no errors if photos and
+    Gaussians differ by noise, which flattens the colours of Gaussians.
     """
     curves, is_large = list[np.ndarray | None]([None] * len(pairs)), False
     stored = cut_blocks(pairs)
@@ -122,8 +122,7 @@ def find_tones(pairs: Pairs, views: Sequence[int]) -> list[np.ndarray | None]:
 def find_grey(pairs: Pairs, views: Sequence[int]) -> dict[int, float]:
     """Find the ``views`` whose photos have no hues although their Gaussians have.
 
-    Returns for each of these views how much the hues of its photo vary, as a share of the variation of the Gaussians'
-    hues.
+    Returns for each such view the variation of the hues in its photo, divided by that of the Gaussians' hues.
     """
     hue_sample = 2_000  # approximate number of pixels of a photo whose hues are compared, if it has as many
     shares, step = dict[int, float](), 1 + pairs.photos[0].size // (3 * hue_sample)
@@ -177,8 +176,8 @@ def have_other_tones(scene: PicturedScene, views: Sequence[int]) -> bool:
 def _group_by_curve(pairs: Pairs, views: Sequence[int]) -> list[list[int]]:
     """Group the views whose photos share a tone curve.
 
-    If the pictures of the Gaussians are drawings, all views are one group, because drawings show tones less exactly. If
-    the pictures are the colours of the views' own Gaussians, each view is a group of its own.
+    If the pictures of the Gaussians are drawings, all views are one group, because drawings show tones less exactly.
+    Otherwise each view is a separate group.
     """
     return [list(views)] if pairs.shown.drawn else [[view] for view in views]
 
@@ -281,7 +280,7 @@ def _note_hidden(scene: PicturedScene, hidden: np.ndarray, views: Sequence[int])
     """Note in which photos of ``views`` something covers the scene, at the pixels ``hidden [v,h,w]``."""
     with_hidden = [view for view in views if hidden[view].any()]
     max_percent = 100 * max((float(hidden[view].mean()) for view in with_hidden), default=0)
-    noted_percent = 1  # there is no note if less than this of every photo is covered
+    noted_percent = 1  # there is no note if no photo is covered by at least this percentage
     if max_percent < noted_percent:
         return
     note(
@@ -312,7 +311,7 @@ def _find_hidden(scene: PicturedScene, changes: Sequence[PhotoChange]) -> tuple[
     def compare_drawn(views: np.ndarray, drawn: RowPicture) -> None:
         """Compare the photos of ``views`` with a drawing, and update ``hidden`` and ``pictures`` of these views."""
         for view in views:
-            known = shown[view] & inside[view] & drawn.known  # a pixel needs a Gaussian of its own
+            known = shown[view] & inside[view] & drawn.known  # a pixel needs a Gaussian
             pictures[view] = drawn.picture
             hidden[view] = differ(view, drawn.picture, known) & differ(view, drawn.drawing, known)
 
@@ -335,8 +334,8 @@ def _change_photos(
     """Change the photos of ``views``, and use the Gaussians' colours at ``hidden [v,h,w]`` pixels and in other views.
 
     Small and large photos are changed alike. The Gaussians' colours are ``pictures [v,h,w,3]``, or renders if
-    ``pictures`` is None. The pixels of views other than ``views`` count only if each view has Gaussians of its own.
-    ``hidden`` is changed in place: all views other than ``views`` and the pixels outside masks become hidden.
+    ``pictures`` is None. The pixels of other views count only if each Gaussian belongs to one view. ``hidden`` is
+    changed in place: all pixels of other views, and pixels outside masks, become hidden.
     """
     other_views = sorted({*range(len(scene))} - {*views})
     hidden[other_views] = True

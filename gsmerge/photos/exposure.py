@@ -8,8 +8,8 @@ views follow from the ratios of all pairs of views by least squares, with a geom
 Gains are removed if nothing predicts the gain of a new view, so that the mean of all gains is the best guess. Photos
 stay unchanged in two cases, in which the gain can be predicted. First, a camera that meters light makes bright places
 darker, also in new photos. Among photos of a metering camera, photos with larger gains are not brighter. Second,
-exposure may drift along a video, so that neighbouring photos have nearly the same gain. If the gain can be predicted,
-photos of mean exposure would be farther from new photos than unchanged photos are, by 1.5 dB in a video of a kitchen.
+exposure may drift along a video, so that neighbouring photos have nearly the same gain. In these cases unchanged photos
+are nearer to new photos than photos of mean exposure are, by 1.5 dB in a video of a kitchen.
 """
 
 from __future__ import annotations
@@ -33,15 +33,14 @@ from gsmerge.types import Cameras, PicturedScene, Scene
 EXPOSURE_PIXELS = 2000  # pixels of a view that are looked up in the other views
 NOISE_LEVEL, CLIPPED_LEVEL = 0.05, 0.95  # colours in between are neither noise nor clipped
 # The bounds from DIFFERENT to UNEXPECTED were chosen on the exports of 15 captures whose exposures were not changed.
-# Exposures differ if the root mean square of the logarithmic gains is above DIFFERENT. If five photos get random gains
-# of 0.8 to 1.25, their root mean square is above DIFFERENT in nine of ten draws. The root mean square is also above
-# DIFFERENT in six of the 15 captures
+# Exposures differ if the root mean square of the logarithmic gains is above DIFFERENT. It is above DIFFERENT in six of
+# these 15 captures, and in nine of ten cases if five photos get random gains of 0.8 to 1.25
 DIFFERENT = 0.06
 # Brightness follows gains if the slope of photos' brightness over their gains, both as logarithms, is above FOLLOWS.
 # The slope is 0.61 to 1.11 for random gains of 0.5 to 2, and at most 0.41 if a camera metered light and logarithmic
-# gains are 0.1 or more. If places differ in brightness by more than the gains, the slope says little. A camera
-# therefore counts as metering only if the correlation of gains and the brightness of places is below OPPOSED, too. The
-# correlation of gains and brightness is -0.67 to -0.99 for cameras that metered light
+# gains are 0.1 or more. If the brightness of places varies more than the gains, the slope says little. So for a
+# metering camera, the correlation of gains and the brightness of places must also be below OPPOSED; it is -0.67 to
+# -0.99 for cameras that metered light
 FOLLOWS, OPPOSED = 0.5, -0.6
 # Gains are unexpected if share_unexpected returns more than UNEXPECTED. For random gains of 0.5 to 2 the function
 # returns 0.71 to 1.22, or 0.67 for four views in a row. If exposure drifts, share_unexpected returns 0.19 to 0.57, and
@@ -56,7 +55,7 @@ NEAREST_VIEWS, FARTHER_VIEWS = 6, 2
 
 @dataclass(frozen=True, eq=False)
 class _Pair:
-    """How much brighter another view shows the surfaces of a view's pixels."""
+    """Measured ratio of brightness between two views, from surfaces that both show."""
 
     view: int
     other: int
@@ -67,7 +66,7 @@ class _Pair:
 def equalise_exposure(scene: PicturedScene, views: Sequence[int], exposure: Exposure) -> PicturedScene:
     """Divide each view's photo and its pixels' Gaussians by the exposure gain of the view, if that is needed.
 
-    The photos of ``views`` show the scene; each view has Gaussians of its own. Clipped pixels of brighter photos no
+    The photos of ``views`` show the scene, and each Gaussian belongs to one view. Clipped pixels of brighter photos no
     longer count if another photo shows their surface unclipped. The record of the run gets a note and the choice
     ``exposure``, the gain of each view in red, green and blue. If exposures differ but photos stay unchanged, a note
     says why.
@@ -218,7 +217,7 @@ def choose_partners(distances: np.ndarray) -> np.ndarray:
 def _solve_gains(pairs: Sequence[_Pair], num_views: int) -> np.ndarray:
     """Solve for the logarithmic gains ``[v,3]`` of all views, with mean zero; without pairs all gains are zero."""
     matrix, right = np.full((num_views, num_views), 1.0 / num_views), np.zeros((num_views, 3))
-    max_weighted_pixels = 1000  # more shared pixels give a pair of views no larger weight
+    max_weighted_pixels = 1000  # above this number of shared pixels, the weight of a pair of views does not grow
     for pair in pairs:
         ends, weight = [pair.view, pair.other], np.sqrt(min(pair.count, max_weighted_pixels))
         matrix[np.ix_(ends, ends)] += weight * np.array([[1, -1], [-1, 1]])

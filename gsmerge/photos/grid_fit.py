@@ -2,7 +2,8 @@
 
 Photos of another shape than their cameras may have bars, or show both eyes of a stereo camera or several pictures side
 by side. If a file has no cameras, its model may have cropped the photos or changed their aspect ratio, and may have cut
-borders off its output. The part and the resizing with which photos best match the pictures of the Gaussians are chosen.
+borders off its output. The choice of part and resizing is the one by which photos best match the pictures of the
+Gaussians.
 """
 
 from __future__ import annotations
@@ -79,9 +80,9 @@ WHOLE_FIT = PartFit()
 def list_parts(size: Size, shape: Size | None, inner: Part) -> list[PartFit]:
     """List the parts of photos of a ``size`` that views may show, likely ones first.
 
-    ``inner`` is the part inside of bars. Views have the aspect ratio of ``shape``. Of parts with another aspect ratio
-    than ``shape``, only the whole and its halves are listed; they come last, and are stretched. If ``shape`` is None,
-    views may have any aspect ratio, and no part is stretched.
+    ``inner`` is the part of a photo without bars. Views have the aspect ratio of ``shape``. The whole photo and its
+    halves are listed even if their aspect ratio differs from ``shape``; then they come last, and are stretched. If
+    ``shape`` is None, views may have any aspect ratio, and no part is stretched.
     """
     counts = product(range(1, _TILES + 1), repeat=2)  # columns and lines of tiles
     tiles = [(x / m, y / n, (x + 1) / m, (y + 1) / n) for m, n in counts for y, x in product(range(n), range(m))]

@@ -37,7 +37,7 @@ _WHITE = np.uint8(255)
 
 
 class CameraMaskError(SceneError):
-    """Raised if pictures that the cameras' file names as masks are photos."""
+    """Raised if the camera file lists photos as masks."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +68,7 @@ class MaskFiles:
         """Read which pixels ``[h,w]`` of a view count, and their weights ``[h,w]``; None: all count, with weight 1."""
         photo, counts, importance = self.photos[view] if self.photos else None, None, None
         alpha = None if photo is None else decode_alpha(photo)
-        min_level = 191  # level of 255; a pixel counts if three quarters of its pixels in the file count
+        min_level = 191  # level of 255; a pixel counts if three quarters of the file's pixels in it count
         if alpha is not None:
             opaque = cut_part(turn_picture(alpha, self.turns[view]), self.part) * _WHITE
             counts = self._reduce(opaque, view) > min_level
@@ -120,8 +120,8 @@ def read_masks(
 ) -> tuple[Masks, list[str]]:
     """Read the masks of a scene's photos; return them and notes.
 
-    Masks that the cameras' file names are used, or if it names none, masks beside the scene. ``stored`` and ``cut`` are
-    fields of :class:`MaskFiles`. SceneError if masks are photos.
+    The masks that the camera file lists are used, or if it lists none, masks beside the scene. ``stored`` and ``cut``
+    are fields of :class:`MaskFiles`. SceneError if masks are photos.
     """
     paths = photos.paths
     views = [view for view in range(len(camera_file)) if not paths or paths[view] is not None]  # with a photo
@@ -166,7 +166,7 @@ def _refuse_photos(
     """
     of_views = {view: mask for view, mask in enumerate(masks) if mask is not None}
     doubts = parallel_map(lambda view: _doubt_mask(of_views[view], photos, view), of_views)
-    if 2 * sum(doubts) > len(of_views):  # a single mask with an infinite doubt is enough
+    if 2 * sum(doubts) > len(of_views):  # one mask that is certainly a photo is enough
         doubtful = [of_views[view].name for view, doubt in zip(of_views, doubts, strict=True) if doubt]
         expected = f"expected black, white and grey pictures for --{option}, found {len(doubtful)} of {len(of_views)}"
         problem = f"{expected} that look like photos, {list_some(doubtful)}"

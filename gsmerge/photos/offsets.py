@@ -1,8 +1,8 @@
 """Search for the parts of a view's picture in a photo, to decide whether the photo was taken from the view's camera.
 
-Pictures of neighbouring views are similar as a whole, but their parts are displaced. Each part of the view's picture is
-searched for around the same place in the photo. The offset of a part counts if its best place stands out from all other
-places. Offsets are zero in the photo of the view itself, but not in the photo of a neighbour.
+Neighbouring views have similar pictures as a whole, but the same part is in different places. So each part of the
+view's picture is searched for around the same place in the photo. The offset of a part counts if the part fits its best
+place clearly better than all other places. Offsets are zero if the photo is the view's, but not if it is a neighbour's.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ CLIPPED = 0.985  # a pixel may be clipped from this level on
 
 @dataclass(frozen=True, eq=False)
 class PhotoChange:
-    """Changes of one photo: first the tones, then the cover."""
+    """Changes of one photo: a new value for each level, and then new colours at the pixels of ``cover``."""
 
     tones: np.ndarray | None = None  # [3,256] float32, new value of each level of each channel
     cover: np.ndarray | None = None  # [h,w] bool, pixels that get `colors`

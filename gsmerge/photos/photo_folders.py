@@ -54,7 +54,7 @@ def find_named_photos(
     file_names = {PurePath(name).name for name in camera_file.names}
 
     def rank(folder: Path) -> tuple[Any, ...]:
-        """Return a key by which better folders sort first: minus the number of cameras with a photo, then the rest."""
+        """Return a key that sorts better folders first: minus the number of cameras with a photo, then the criteria."""
         proposed = propose_images(folder, list(pools[folder]), camera_file.names, count_pixels)
         first = next(filter(count_pixels, filter(None, proposed)), None)
         if first is None:
@@ -63,7 +63,7 @@ def find_named_photos(
         has_other_shape = min(camera_size) > 1 and not same_shape(camera_size, size)
         count, num_exact = len({*proposed} - {None}), sum(path.name in file_names for path in filter(None, proposed))
         look = is_grey(first), size != camera_size, has_other_shape, -count_pixels(first)
-        depth = len(pools[folder]), -len(folder.parts), folder  # the innermost of several folders with the same photos
+        depth = len(pools[folder]), -len(folder.parts), folder  # prefers the innermost of folders with the same photos
         return -count, -num_exact, not folder.is_relative_to(roots[0]), *look, *depth
 
     max_folders = 4  # folders whose photos are compared with the views

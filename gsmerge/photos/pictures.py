@@ -1,7 +1,7 @@
 """Make small pictures of what Gaussians show from cameras, to compare them with photos.
 
 Colours are divided by opacity, so faint or sparse Gaussians have the colours of solid ones. The opacity of a pixel is
-its weight. Photos are averaged with the same weights as pictures, so pixels without Gaussians count in neither.
+its weight. Photos and pictures are averaged with these weights, so pixels without Gaussians count in neither.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class ViewPictures:
 
     pictures: np.ndarray  # [v,h,w,3] colours in [0, 1], as of solid Gaussians; 0 where nothing is shown
     weights: np.ndarray  # [v,h,w] opacity, in [0, 1]; 0 outside masks
-    drawn: bool  # True for renders, which wrong depth displaces; False for colours of each view's own Gaussians
+    drawn: bool  # True for renders, which wrong depth displaces; False for colours of the Gaussians at their pixels
 
     def __len__(self) -> int:
         return len(self.pictures)
@@ -39,7 +39,7 @@ class ViewPictures:
         return replace(self, pictures=self.pictures[ids], weights=self.weights[ids])
 
     def shrink(self, side: int) -> ViewPictures:
-        """Average the pictures by their weights to at most ``side`` pixels of the longer side."""
+        """Shrink the pictures, by weighted averages, to at most ``side`` pixels on the longer side."""
         width, height = fit_size(self.weights.shape[2:0:-1], side)
         weights = shrink_pictures(self.weights, width, height)
         return replace(self, pictures=average(self.pictures, self.weights, weights), weights=weights)
@@ -56,12 +56,12 @@ class Pairs:
         return len(self.photos)
 
     def shrink(self, side: int) -> Pairs:
-        """Average photos and pictures by opacity to at most ``side`` pixels of the longer side."""
+        """Shrink photos and pictures, by weighted averages, to at most ``side`` pixels on the longer side."""
         small = self.shown.shrink(side)
         return Pairs(average(self.photos, self.shown.weights, small.weights), small)
 
     def exchange(self) -> Pairs:
-        """Return a copy in which photos take the place of pictures, and pictures the place of photos."""
+        """Return a copy with photos and pictures exchanged."""
         return Pairs(self.shown.pictures, replace(self.shown, pictures=self.photos))
 
     def with_photos(self, photos: np.ndarray) -> Pairs:
@@ -101,9 +101,9 @@ def pair_photos(scene: Scene, photos: np.ndarray) -> Pairs:
 def show_views(scene: Scene, side: int | None = None, frame: Frame | None = None) -> ViewPictures:
     """Make small pictures of what a scene's Gaussians show in its views.
 
-    If each view has Gaussians of its own, a view's picture has the colours of a sample of its Gaussians. If not, a
-    picture is a render of a sample of all Gaussians. ``side`` is the number of pixels on the longer side, by default
-    :data:`PICTURE_PIXELS`. ``frame`` is the canonical frame of the scene, if known.
+    If each Gaussian belongs to one view, a view's picture has the colours of a sample of its Gaussians. If views share
+    Gaussians, a picture is a render of a sample of all Gaussians. ``side`` is the number of pixels on the longer side,
+    by default :data:`PICTURE_PIXELS`. ``frame`` is the canonical frame of the scene, if known.
     """
     if scene.has_own_pixels:
         return _show_rows(scene, PICTURE_PIXELS) if side is None else _show_rows(scene, 2 * side).shrink(side)

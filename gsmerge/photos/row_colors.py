@@ -1,9 +1,9 @@
-"""Scene without photos -> the scene with the colours of its rows as photos; each view needs Gaussians of its own.
+"""Scene without photos -> the scene with the colours of its rows as photos, if each Gaussian belongs to one view.
 
 Feed-forward models take the colour of a pixel's Gaussian from the photo. The Gaussians' colours are compared with a
-drawing of the view's own Gaussians from its own camera, after both are blurred. A solid drawing replaces the colours if
-they differ from the drawing, and if the Gaussians of a pixel are so faint that their colours mean little. Pixels with
-neither a colour nor a solid drawing do not count.
+drawing of the view's own Gaussians from its own camera, after both are blurred. A pixel shows an opaque drawing instead
+of its Gaussians' colour if both differ, or if its Gaussians are so faint that their colours mean little. Pixels with
+neither a colour nor an opaque drawing do not count.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import in_turn
 from gsmerge.types import PicturedScene, Scene
 
-# Names, in messages, of the pictures to which results are fitted and with which results are compared. If photos are
-# missing, the pictures are the colours of the rows, or renders if the rows belong to no pixels
+# Names, in messages, of the pictures to which results are fitted and with which they are compared. Without photos,
+# these pictures are the colours of the rows, or renders if the rows belong to no pixels
 OWN_PHOTOS = "the scene's own photos"
 PHOTOS = "photos"
 ROW_COLORS = "the model's own pixels"
@@ -34,8 +34,8 @@ RENDERS = "renders of the input"
 NO_PHOTOS = f"no photos: {ROW_COLORS} are used instead; name photos with --images"
 FAINT_OPACITY = 0.1  # opacity of a pixel's Gaussians below which their colours mean little
 # Standard deviation in pixels. After this blur, colours from photos differ from drawings by at most .18 of [0, 1] in
-# the exports of nine captures. After a blur of only 2 pixels, colours and drawings differ by .39 where Gaussians of
-# wrong depth hide others
+# the exports of nine captures. After a blur of only 2 pixels, they differ by .39 where Gaussians of wrong depth hide
+# others
 ROW_BLUR_PIXELS = 8.0
 T = TypeVar("T")
 

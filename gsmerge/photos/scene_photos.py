@@ -85,7 +85,7 @@ class ScenePhotos:
 
 @dataclass(frozen=True)
 class Proposal:
-    """Files that may be photos of c cameras, of which one is proposed for each camera."""
+    """Files that may be photos of c cameras, and the file that is proposed for each camera."""
 
     folder: Path
     pool: tuple[Path, ...]  # all files
@@ -482,8 +482,8 @@ def _describe_spare(proposal: Proposal, chosen: Sequence[Assignment | None], *, 
     """Note the photos without a camera in the folders of the used photos, since they may show other parts of the scene.
 
     If each Gaussian belongs to a pixel of a view (``are_pixels``), the cameras of the views see the whole scene. With
-    ``are_pixels``, photos without a camera are noted only if names propose photos, and if more photos are used than are
-    without a camera.
+    ``are_pixels``, photos without a camera are noted only if names propose photos, and if fewer photos lack a camera
+    than are used.
     """
     used = [proposal.pool[assignment.photo] for assignment in chosen if assignment is not None]
     named = [proposal.pool[photo] for photo in proposal.named if photo is not None]

@@ -2,8 +2,8 @@
 
 A photo and a view are a wrong pair if the photo does not show the view. The similarity of a photo and a picture is the
 correlation of their local contrast at two sizes. Exposure, white balance and soft colours hardly change this
-correlation. Correlations are converted to Fisher's z, whose noise does not depend on its value. Nearly all pairs of a
-scene are wrong, so the median absolute deviation of all z is the noise of wrong pairs.
+correlation. Correlations are converted to Fisher's z, whose noise does not depend on its value. Nearly all pairs of
+photos and views are wrong, so the median absolute deviation of all z is the noise of wrong pairs.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ class Comparer:
 def _make_filters(small: ViewPictures, quarters: Sequence[int]) -> _Filters:
     """Make filters for photos that are stored turned by any of the numbers ``quarters`` of quarter turns.
 
-    For each view and each number of turns there is a filter, and one more for the mirrored photo.
+    Each view has two filters for each number of quarter turns, one of them for the mirrored photo.
     """
     orientations = tuple(quarter + mirrored for mirrored in (0, ORIENTATIONS // 2) for quarter in quarters)
     products, weights, lengths = [], [], []

@@ -66,8 +66,8 @@ def camera_kinds(cameras: Cameras) -> np.ndarray:
 def subset(scene: SceneT, view_ids: Sequence[int]) -> SceneT:
     """Return the scene with only the views ``view_ids``.
 
-    If views have Gaussians of their own, only the Gaussians of these views stay. If not, all Gaussians stay, and the
-    pixels of Gaussians are unknown.
+    If each Gaussian belongs to one view, only the Gaussians of ``view_ids`` stay. If views share Gaussians, all
+    Gaussians stay, and their pixels are unknown.
     """
     ids = list(view_ids)
     fields = {name: array[ids] for name, array in vars(scene).items() if name in BY_VIEW and array is not None}

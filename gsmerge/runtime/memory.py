@@ -18,9 +18,8 @@ import numpy as np
 # Files with the memory limit of a control group, version 2 and version 1
 LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
 # Parameters of glibc with their values, see mallopt(3). An array of 32 MiB or more gets separate pages, which return to
-# the system when the array is deleted. Of the freed memory of smaller arrays, the process keeps up to 256 MiB for
-# further arrays. With glibc's default values, each array gets new pages that the system has to clear, which takes a
-# tenth of the time of `view`
+# the system when the array is deleted. The process keeps up to 256 MiB of the memory of deleted smaller arrays for new
+# arrays. With glibc's default values, the system clears new pages for each array, a tenth of the time of `view`
 M_MMAP_THRESHOLD, M_TRIM_THRESHOLD = (-3, 1 << 25), (-1, 1 << 28)
 MAPPED_BYTES = 1 << 28  # arrays of this size or more are mapped from files
 # Bytes of memory that a run needs
@@ -106,7 +105,7 @@ def memory_problem(needed: int, remedy: str = FEWER_PIXELS) -> str | None:
 def keep_memory() -> None:
     """Let new arrays reuse the memory of deleted arrays, if the C library can.
 
-    Only processes that do a single job call this function, after which a process keeps more memory than it uses.
+    The process then keeps more memory than it uses, so only processes that do a single job call this function.
     """
     with suppress(AttributeError, OSError, TypeError):  # not glibc
         mallopt = ctypes.CDLL(None).mallopt

@@ -24,7 +24,7 @@ STAGES = (
 )  # fmt: skip
 FIT_STEP = "fit: "  # texts that report steps of a fit begin with this text
 BEFORE_FIT = 0.8  # share of the seconds of stages without fits that pass before the fits
-# Memory is released after these stages, whose threads have freed much memory that other threads cannot use
+# After these stages memory is released, because their threads have freed much memory that other threads cannot use
 RELEASED = ("prepare", "segment", "encode", "match", "refine", "fit")
 
 
@@ -147,7 +147,7 @@ def stage(name: str) -> Iterator[None]:
     if record is None or record.running is not None:
         yield
         return
-    if name not in record.seconds:  # the second part of a stage is not a new step
+    if name not in record.seconds:  # if a stage continues after a break, this is not a new step
         report_progress(name, STAGES.index(name) if name in STAGES else len(record.seconds), len(STAGES))
     record.running, start = name, time.perf_counter()
     try:

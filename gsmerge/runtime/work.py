@@ -1,8 +1,8 @@
 """Make calls in this process, in other processes of this machine, or on a Ray cluster.
 
 Ray is an optional dependency, which schedules calls by their threads and memory. If a process on this machine dies, the
-call that it was making is lost. On a cluster, another process repeats the call, with the same result. The pool of
-processes of this machine is in :mod:`gsmerge.runtime.processes`.
+call that it was making is lost. On a cluster, another process repeats the call, with the same result. Processes of this
+machine are in :mod:`gsmerge.runtime.processes`.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class WorkerPool(ABC):
             yield from ended
 
     def has_room(self, call: Call) -> bool:
-        """Return true if a call may start beside the calls that run; if no call runs, the answer has to be true."""
+        """Return true if a call may start beside the running calls; always true if no call runs."""
         return True
 
     @abstractmethod

@@ -46,7 +46,7 @@ class Model:
 
 @dataclass(frozen=True)
 class Exporter:
-    """Code that saves Gaussians, shared by some models, and the properties by which its files are recognised."""
+    """Code of one or more models that saves Gaussians, and the properties by which its files are recognised."""
 
     name: str  # on the command line
     models: tuple[Model, ...]  # the models that use it
@@ -106,8 +106,9 @@ _EXPORTERS = (
         "logit", "view-major",
         cameras=("DA3 npz", "COLMAP binary", "COLMAP text", ESTIMATED),
     ),
-    # Models of the pixelSplat family share code but differ in order, trimming and rotations. Each centres the world on
-    # its median, divides it by a quantile and rotates it upright. No file stores this scale and this shift.
+    # Models of the pixelSplat family share code, but differ in the order of rows, trimmed borders and rotations. Each
+    # model centres the world on its median, divides it by a quantile and rotates it upright. No file stores scale and
+    # shift.
     Exporter(
         "pixelsplat",
         (Model("pixelSplat", "dcharatan/pixelsplat 32b1b66", "`gaussians/RUN/STEP.ply`; no cameras", _NAME_CAMERAS),),
@@ -230,7 +231,7 @@ _EXPORTERS = (
         ),
         "raw", "view-major",
     ),
-    # Gaussians merged in voxels or across views.
+    # Models that merge Gaussians in voxels or across views.
     Exporter(
         "anysplat",
         (
@@ -299,8 +300,8 @@ _EXPORTERS = (
         ),
         "logit", "view-major", normals=False,
     ),
-    # Long-LRM writes normals as bytes, and 45 harmonics for every degree. When Long-LRM prunes, it sorts rows by
-    # opacity.
+    # Long-LRM writes normals as bytes, and always 45 values of higher harmonics, whatever their degree. When Long-LRM
+    # prunes, it sorts rows by opacity.
     Exporter(
         "longlrm",
         (
@@ -392,8 +393,8 @@ def choose_exporters(name: str, info: FileInfo, order: str, cameras: str) -> tup
     """Return the exporter with a name; for "auto", all exporters that may have written the file.
 
     An exporter may have written the file if it writes the file's columns, the format of its ``cameras`` ("" without
-    cameras), and its ``order`` of rows ("none" if rows have no pixels). If the file has a mark of exporters, only
-    exporters with this mark are returned, even if none of them writes rows in the order ``order``.
+    cameras), and its ``order`` of rows ("none" if rows have no pixels). If exporters that leave a mark in their files
+    match, only they are returned, even if none of them writes rows in the order ``order``.
     """
     exporter = find_exporter(name)
     if exporter is not None:

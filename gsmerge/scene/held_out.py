@@ -37,10 +37,10 @@ def read_held_out(load: Loaded, cameras: StrPath, images: StrPath | None = None)
     """Read held-out photos and their cameras, in any format that a scene may have.
 
     Views from which the scene was made are left out. If the file has views of the scene under the same names, their
-    poses show how the file's world maps to the world of the Gaussians. If names do not show how both worlds map, the
-    file is assumed to share the world of the scene's own cameras. Poses are read in the convention in which the scene's
-    cameras fit. ``images`` is the folder of the photos; if ``images`` is None, the camera file names the photos. Raises
-    SceneError if a file is missing or damaged, or if no view remains.
+    poses show how the file's world maps to the world of the Gaussians. If the poses of shared names show no such map,
+    the file is assumed to be in the world of the scene's own cameras. Poses are read in the convention in which the
+    scene's cameras fit. ``images`` is the folder of the photos; if ``images`` is None, the camera file names the
+    photos. Raises SceneError if a file is missing or damaged, or if no view remains.
     """
     path = Path(cameras)
     if not path.exists():

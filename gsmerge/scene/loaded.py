@@ -27,7 +27,7 @@ class Loaded:
     # the cameras as stored in their file, in the order of the views; None if there are none, or if they do not fit
     cameras: CameraFile | None
     exporters: tuple[Exporter, ...]  # the exporters that may have written the file, or the one that the caller named
-    notes: tuple[str, ...]  # adapted or unusual content and doubts, one sentence each, without a full stop
+    notes: tuple[str, ...]  # notes on adapted or unusual content, and doubts, one sentence each, without a full stop
     # how well every view's Gaussians project into their own pixels; None if rows have no pixels
     alignment: Alignment | None = None
     recovery: Recovery | None = None  # the layout of rows that fits best, and by how much; None without pixels
@@ -38,7 +38,7 @@ class Loaded:
     photos_explain: bool = False  # whether the photos that names propose explain what most views show
     stats: Mapping[Path, tuple[int, ...]] = field(default_factory=dict)  # states of the files before they were read
     sha256: str | None = None  # hash of the files of Gaussians, one after the other; None if it was not asked for
-    own_views: int = 0  # number of views of the grid that the rows form, if they have no pixels in the cameras; else 0
+    own_views: int = 0  # number of views that the rows form, if the rows are not pixels of the cameras; else 0
 
     @property
     def doubts(self) -> list[str]:

@@ -89,7 +89,7 @@ def read_scene(
         images: Folder of images, an ``.npz`` that holds images, or "none". If None, images are searched as cameras are.
         masks: Folder of images with the names of the photos, dark where a photo does not count, or "none". If None, the
             masks that ``transforms.json`` names are used, or the folder ``masks`` beside the photos, and the photos'
-            transparency. Lighter greys are weights in a fit.
+            transparency. Greys between dark and white weigh a pixel in a fit.
         protect: Folder of images with the names of the photos, white where a text or a face has to stay sharp; see
             :attr:`Scene.importance`.
         opacity: How opacities are stored; see :func:`gsmerge.io.read_gaussians`.
@@ -203,9 +203,9 @@ def _read_without_cameras(
 ) -> Loaded | SceneError:
     """Read a scene without its camera file, with a note; cameras are estimated from the rows instead.
 
-    ``result`` is what reading with the camera file gave: a scene with fewer views than the rows form, or an error.
-    ``result`` is returned if the scene cannot be read without the camera file, or if photos that the caller named would
-    not be used without it.
+    ``result`` is the result of reading with the camera file: a scene with fewer views than the rows form, or an error.
+    ``result`` is returned if the scene cannot be read without the camera file, or only without photos that the caller
+    named.
     """
     remaining = replace(files, cameras=None, images=None if files.images == files.cameras else files.images)
     load = _read_views(ply, remaining, hints, photos=photos)
@@ -222,10 +222,9 @@ def _read_without_cameras(
 
 
 def _choose_cameras(ply: GaussianFile, files: SceneFiles, hints: ReadHints, *, photos: bool) -> Loaded | SceneError:
-    """Read a scene with the first of its camera files that certainly fits, or else with the first that can be read.
+    """Read a scene with its first camera file that certainly fits, or else with the first that can be read.
 
-    If there are several camera files, a note says which one is read. Returns the first error if the scene can be read
-    with no camera file.
+    If there are several camera files, a note says which one is read. If none can be read, returns the first error.
     """
     loads, errors = list[Loaded](), list[SceneError]()
     for choice in files.choices:
@@ -264,8 +263,8 @@ def _read_or_error(read: Callable[[], T]) -> T | SceneError:
 def _note_left_out(load: Loaded, files: SceneFiles, left_out: list[str], cause: SceneError) -> Loaded:
     """Return a scene with a doubt which says what is left out, why, and what the user can do.
 
-    ``left_out`` describes these files in words. If photos are not used without these files, the doubt also names the
-    photos, and replaces the notes on photos.
+    ``left_out`` describes the files that are left out. If photos cannot be used without these files, the doubt also
+    names the photos, and replaces the notes on photos.
     """
     photos = f"the photos in {files.images or files.ply.parent}"
     photo_notes = tuple(text for text in load.notes if text.startswith(f"{photos} are not used"))
@@ -297,9 +296,9 @@ def _add_photos(
 ) -> Loaded | SceneError:
     """Combine Gaussians and cameras with their photos; return the error if the cameras do not see the Gaussians.
 
-    Photos are files of their own, or all photos are inside one file. Photos that the caller did not name are left out,
-    with a note, if they cannot be read or do not show the views; see :func:`_leave_out_photos`. If ``photos`` is False,
-    all photos are left out.
+    Each photo is a separate file, or one file has all photos. Photos that the caller did not name are left out, with a
+    note, if they cannot be read or do not show the views; see :func:`_leave_out_photos`. If ``photos`` is False, all
+    photos are left out.
     """
     proposal = _read_or_error(partial(propose_photos, files, camera_file)) if photos else None
     if isinstance(proposal, Proposal) and proposal.by_names:
@@ -347,7 +346,7 @@ def _assign_photos(make_scene: MakeScene, camera_file: CameraFile, proposal: Pro
     1. If the photos have another shape than the cameras, parts of the photos are used if they show the views.
     2. The scene is read with the proposed photos, or if these photos cannot be used, without photos.
     3. The views of this scene decide which photo belongs to a view. Parts of photos are used if the parts fit better.
-    4. The scene is read again if other photos belong to the views than were proposed.
+    4. If the views show photos other than the proposed ones, the scene is read again.
 
     Notes name photos that cannot be read, and views without a photo. Returns an error if no photo shows a view.
     """
@@ -417,8 +416,8 @@ def _leave_out_photos(
 
     ``cause`` says why photos and cameras do not fit each other. Photos that the caller named are never left out. Other
     photos are left out if it is certain that the cameras belong to the scene: if rows are pixels of the cameras, if the
-    cause is a photo, or if the photos were found by the cameras' names. That cameras see the Gaussians is no proof,
-    because cameras of another scene may see them, too.
+    cause is a photo, or if the photos were found by the cameras' names. Cameras that merely see the Gaussians may still
+    belong to another scene.
     """
     are_named = "images" in files.named
     if are_named and "cameras" not in files.named and cause.path == camera_file.path:

@@ -39,7 +39,7 @@ def take_gaussians(ply: GaussianFile, result: AlignmentResult) -> tuple[Gaussian
         order = np.argsort(row_pixels, kind="stable")
         rows, row_pixels = rows[order], row_pixels[order]
     gaussians = ply.gaussians if is_sorted and len(rows) == len(taken) else ply.gaussians[rows]
-    # each row has a pixel of its own
+    # each row has a different pixel
     if row_pixels[0] >= 0 and (is_sorted or _increases(row_pixels)):
         has_row = np.zeros(prod(grid), bool)
         has_row[row_pixels] = True

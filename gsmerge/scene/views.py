@@ -39,7 +39,7 @@ def read_scene_cameras(ply: GaussianFile, files: SceneFiles) -> CameraFile | Non
         stored = read_cameras(files.cameras, folder=files.ply.parent)
         if not stored.has_intrinsics:
             raise missing_intrinsics(stored.path)
-        # repeated views may have rows of their own if the number of rows is a multiple of the number of views
+        # each repeated view may have rows, too, if the number of rows is a multiple of the number of views
         return drop_repeats(stored) if len(ply.gaussians) % len(stored) else stored
     if files.is_state:  # cameras of a state are in its own file, or there are none
         return None

@@ -20,7 +20,7 @@ from gsmerge.values.words import count_words
 
 @dataclass(frozen=True)
 class JoinedScene:
-    """Several scenes joined into one, in the frame of the first scene used."""
+    """Several scenes joined into one, in the frame of the first joined scene."""
 
     scene: Scene
     used: tuple[int, ...]  # numbers of the input scenes that are joined
@@ -32,7 +32,7 @@ class JoinedScene:
 
 
 def join_scenes(scenes: Sequence[Scene], paths: Sequence[Path]) -> JoinedScene:
-    """Join scenes of one place, which have pixels, and frames and scales of their own, into one scene.
+    """Join scenes of one place, whose frames and scales differ, into one scene.
 
     ``paths`` are the files of the scenes, for messages. Raises SceneError if a scene has no pixels, if views or
     harmonics differ in size, or if no two scenes show the same surfaces.
@@ -134,7 +134,7 @@ def concat_scenes(scenes: Sequence[Scene], photos: np.ndarray | None = None) -> 
 
 
 def _concat_pixels(scenes: Sequence[Scene]) -> Pixels | None:
-    """Concatenate the pixels of scenes; None if the views of any scene have no Gaussians of their own."""
+    """Concatenate the pixels of scenes; None if the views of any scene share Gaussians."""
     homes, fronts, num_rows, num_views = list[np.ndarray](), list[np.ndarray](), 0, 0
     for scene in scenes:
         if not scene.has_own_pixels:

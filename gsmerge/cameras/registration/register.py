@@ -1,10 +1,10 @@
 """Register scenes of one place: find the similarities between their frames from photos and depths.
 
-A keypoint is a point of its scene, at the depth of the Gaussian in its pixel. If keypoints in photos of two scenes
-match, their points are the same place. Three matches of keypoints determine a similarity (Umeyama 1991). Similarities
-are fitted to random triples, and the similarity that agrees with most matches is chosen. Then all scenes are moved at
-once by Gauss-Newton steps, until points project to their keypoints in the other photos. Because a single depth may be
-wrong, residuals allow a point to move along its ray, within the standard deviation of depths.
+Each keypoint of a photo stands for a point of the scene, at the depth of the Gaussian in the keypoint's pixel. Matching
+keypoints of two scenes stand for the same place. Three matches of keypoints determine a similarity (Umeyama 1991).
+Similarities are fitted to random triples, and the similarity that agrees with most matches is chosen. Then all scenes
+are moved at once by Gauss-Newton steps, until points project to their keypoints in the other photos. Because depths may
+be wrong, errors along a point's ray count less.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ from gsmerge.types import Scene
 DEPTH_SPREAD = 0.1  # standard deviation of the logarithm of a depth, before it is measured
 NORMAL_2D = 1 / 1.1774  # standard deviation of two normal components, divided by the median length of their vector
 AGREE = 9.0  # largest squared residual of a match that agrees; residuals are in standard deviations
-# Largest squared residual of the matches that each round uses, divided by AGREE. The first rounds allow large
-# residuals, because errors add up along a chain of scenes
+# Each round uses the matches whose squared residual is at most this multiple of AGREE. The first rounds use large
+# multiples, because errors add up along a chain of scenes
 LOOSE = (100.0, 10.0, 2.0, 2.0)
 MIN_MATCHES = 16  # least number of agreeing matches of two connected scenes; unrelated photos have up to 5
 SIMILARITY_DAMPING = Damping(steps=40, first=1e-4, decrease=0.1, increase=10.0, largest=1e6, min_gain=1e-9)
@@ -105,7 +105,7 @@ def connect(matches: KeypointMatches) -> tuple[Similarity, KeypointMatches] | No
     best = int(np.argmax([(1 - trial_squares / AGREE).clip(0).sum() for trial_squares in squares]))
     similarities: Similarities = (trials[best], IDENTITY)
     agree = squares[best] < AGREE
-    rounds = 3  # in each, the similarity is refined and the agreeing matches are selected anew
+    rounds = 3  # each round refines the similarity, and selects the agreeing matches anew
     for _ in range(rounds):
         if agree.sum() < MIN_MATCHES // 2:
             return None
@@ -222,7 +222,7 @@ def _measure_spreads(
     Returns the matches with the standard deviation of keypoints, and the standard deviation of logarithms of depths.
     """
     errors = [_two_way_residuals(similarities, pair, DEPTH_SPREAD)[0].values for pair in matches]
-    # residuals are in standard deviations; here they become pixels, and differences of logarithms of depths
+    # converts residuals from standard deviations to pixels, and to differences of logarithms of depths
     lengths = [pair.spread * np.sqrt((xyz[:, :2] ** 2).sum(1)) for pair, xyz in zip(matches, errors, strict=True)]
     depth_errors = np.abs(np.concatenate(errors)[:, 2]) * DEPTH_SPREAD
     depth_spread = NORMAL_SPREAD * float(lower_median(depth_errors))
@@ -255,7 +255,7 @@ def _chain_largest_set(links: Sequence[tuple[Similarity, KeypointMatches]], coun
     to_first = invert_similarity(first)
 
     def move(similarity: Similarity | None) -> Similarity | None:
-        """Return a similarity that leads into the frame of the first scene instead of its own."""
+        """Return a similarity that leads into the frame of the first scene instead of the scene's frame."""
         if similarity is None:
             return None
         return IDENTITY if similarity is first else compose(to_first, similarity)
