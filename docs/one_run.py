@@ -323,7 +323,7 @@ def plan_section(run: Run) -> str:
         ]),
         text(
             say(
-                "No option limits the number of Gaussians, and each view has Gaussians of its own, so"
+                "No option limits the number of Gaussians, and every Gaussian belongs to a pixel, so"
                 f" {plan.settings['superpixels']} of the",
                 limits.exact is None and not plan.keeps_fidelity and plan.target_psnr is None,
             ),
@@ -378,8 +378,8 @@ def build_section(run: Run) -> str:
             f"The pixel lies in superpixel {run.label}, which has {size} pixels.",
             "**`encode`** gives each superpixel a Feature Gaussian with the mean and the covariance of its Gaussians,",
             "weighted by their opacities.",
-            f"**`correct`** lowers the gain of {faint} of the {len(features)} Feature Gaussians: more views see",
-            say("through these than confirm them, so their depth is likely wrong.", plan.weakens and faint > 0),
+            f"**`correct`** makes {faint} of the {len(features)} Feature Gaussians fainter, because more views see",
+            say("through each of them than confirm its depth.", plan.weakens and faint > 0),
         ),
         text(
             "**`match`** finds Feature Gaussians of different views that overlap and have similar colours, and so",
@@ -407,8 +407,8 @@ def build_section(run: Run) -> str:
         ),
         text(
             f"**`prune_and_fill`** leaves out {len(before - after)} Gaussians, which change no photo by more than",
-            "rounding does, and adds Gaussians where cameras between the photos see nothing,",
-            say("but none in this scene.", not others),
+            "rounding does. Places that cameras between the photos see empty would be filled,",
+            say("but this scene has none.", not others),
         ),
     ])  # fmt: skip
 

@@ -102,8 +102,8 @@ CLAIMS: dict[str, tuple[str, ...]] = {
         f"A block also takes views of its neighbours, at most a {part(partition.SHARED)} as many as its own",
         f"A block asks for up to {'twice' if blocks.MOST_DENSITY == 2 else blocks.MOST_DENSITY} as many superpixels",
         f"at {seams.SEAM_RATE:g} times the usual ones, and fall to a tenth",
-        f"{word(seams.SEAM_VIEW_STEPS)} for each photo that shows many such Gaussians, or {word(seams.ROOM_VIEW_STEPS)}"
-        f" if at least {part(seams.ROOM_SHARE)} of all Gaussians are at seams",
+        f"{word(seams.SEAM_VIEW_STEPS)} for each photo that shows many Gaussians at seams, or"
+        f" {word(seams.ROOM_VIEW_STEPS)} if at least {part(seams.ROOM_SHARE)} of all Gaussians are at seams",
         f"The default takes {plan.EFFORTS['default'].steps} steps for up to {plan.USUAL_VIEWS} views",
         f"A block whose process or node was lost is done again, up to {word(work.RETRIES)} times",
         f"| GB per million | {' | '.join(map(degree, range(5)))} |",
@@ -117,7 +117,7 @@ CLAIMS: dict[str, tuple[str, ...]] = {
     "docs/internals/notebook.md": (
         f"a weight that grows from 0 to {RATES.edge_weight:g} over the run",
         f"(**kept**: every {word(RATES.outside_every, ordinal=True)}, {outside.PLACES})",
-        f"{fit_pairs.RENDERS_STEP:g} / sqrt(share that stays)",
+        f"{fit_pairs.RENDERS_STEP:g} / sqrt(share of Gaussians kept)",
     ),
     COMPACT: (
         f"--effort draft`: {plan.EFFORTS['draft'].steps} steps, no merging across views",
