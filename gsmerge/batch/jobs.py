@@ -195,7 +195,7 @@ def find_jobs(
 def _find_clash(
     job: Job, out: Path, scenes_by_output: Mapping[str, Sequence[str]], inputs: Collection[str]
 ) -> str | None:
-    """Return why a result cannot have its name; None if no other result and no scene has this name."""
+    """Return why a result cannot have its name, or None if no other result and no scene has the name."""
     for name in job.outputs:
         scenes = scenes_by_output[os.path.normcase(name)]
         if len(scenes) > 1:

@@ -40,7 +40,7 @@ class Optimiser:
         return None if self.poses is None else self.poses.viewmats
 
     def step(self, state: FitState, step: Step) -> float:
-        """Change a state by one Adam step on one view; return the mean squared error of the pixels that count."""
+        """Change a state by one Adam step on one view; return the weighted mean squared error of the pixels."""
         rates = self.run.job.options.tuning
         weight = self.run.weight(step)
         photo, camera = self.select_view(step)

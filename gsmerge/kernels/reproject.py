@@ -31,7 +31,7 @@ _see_points = declare(
 
 
 def see_points(points, viewmats, Ks, depths, width, height, near, behind):
-    """Return a mask ``[v,n]`` of ``points [n,3]`` inside the picture of each camera, and one of those that it sees.
+    """Return a mask ``[v,n]`` of ``points [n,3]`` inside each camera's picture, and a mask ``[v,n]`` of points seen.
 
     A point is inside only if its depth is more than ``near``. A point inside is seen if its depth is at most ``behind``
     times the depth of the surface at its projection. ``depths [v,lines,columns]`` are the depths of surfaces in a grid

@@ -85,7 +85,7 @@ def gradients_of(
     poses = np.empty((num_blocks, POSE), np.float32) if with_viewmat else None
 
     def blend_tiles(span: tuple[int, int]) -> None:
-        """Write the sums of each Gaussian over each of a range of tiles."""
+        """For each tile of a range, write the sums of each Gaussian over the tile."""
         blend_backward(*tiled.lists, colors, *span, image, transmittance, grad_image, grad_left, slots)
 
     def project(span: tuple[int, int]) -> None:

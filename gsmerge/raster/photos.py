@@ -58,8 +58,8 @@ class PhotoScore:
 class Sample:
     """Every ``stride``-th column and row of a photo, from ``column`` and ``row`` on.
 
-    These pixels form a smaller photo. The camera of the smaller photo projects to the centres of the sampled pixels,
-    with the low-pass of the whole photo.
+    The sampled pixels form a smaller photo. The camera of the smaller photo projects to the centres of the sampled
+    pixels, with the low-pass of the whole photo.
     """
 
     stride: int = 1
@@ -292,7 +292,7 @@ def _average_scores(scores: Sequence[RenderScore]) -> PhotoScore:
 
 
 def _score_render(image: np.ndarray, covered: np.ndarray, photos: Photos, view: int, every: int) -> RenderScore:
-    """Score a render ``[h,w,3]`` against a view's photo, over all scored pixels and over those in ``covered [h,w]``.
+    """Score a render ``[h,w,3]`` against a view's photo, over all scored pixels and over ``covered [h,w]`` pixels.
 
     The render is clipped in place. ``every`` is as in :func:`score_photos`.
     """

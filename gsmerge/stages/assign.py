@@ -21,10 +21,10 @@ from gsmerge.types import Groups, Scene
 def assign(scene: Scene, groups: Groups, *, by_contribution: bool = False) -> Members:
     """Return all Gaussians of a canonical scene as members of superpixels, each with its pixel.
 
-    A Gaussian belongs to the superpixel of its pixel. If views have no Gaussians of their own, ``by_contribution``
-    assigns each Gaussian to the superpixel, of any view, in which the sum of its blending weights is largest (paper,
-    supplement "Compaction of Non-Pixel-Aligned FF Backbones"). Every view is drawn to measure the sums of blending
-    weights. Raises UsageError if no view sees any Gaussian.
+    A Gaussian belongs to the superpixel of its pixel. If Gaussians belong to no pixels, ``by_contribution`` assigns
+    each Gaussian to the superpixel, of any view, in which the sum of its blending weights is largest (paper, supplement
+    "Compaction of Non-Pixel-Aligned FF Backbones"). Every view is drawn to measure the sums of blending weights. Raises
+    UsageError if no view sees any Gaussian.
     """
     members = scene_members(scene)
     if by_contribution and not scene.has_own_pixels:

@@ -1,9 +1,9 @@
 """Find the Gaussians of the sky in photos, without a network or a download.
 
 In a photo, the sky is a smooth region that begins at the upper border and is nowhere warmer than grey. The sky also
-becomes paler towards the horizon. A cloudy sky may not become paler, so a region also counts if it is several times as
+becomes paler towards the horizon. A cloudy sky may not become paler, so a region is also sky if it is several times as
 far away as the rest. Ceilings and white walls may be smooth, grey and at the upper border as well. But ceilings and
-walls seldom become paler or are far away, and never in several views.
+walls seldom become paler, are seldom far away, and never do either in several views.
 """
 
 from __future__ import annotations

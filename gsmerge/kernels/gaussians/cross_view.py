@@ -49,7 +49,8 @@ def nearest_of_others(points, views, order, axes, splits, first, last, most, out
 
     Args:
         points: Points of the tree.
-        views: ``[n]`` int64. A view below 0 differs from all views.
+        views: ``[n]`` int64. A point with a number below 0 belongs to no view, so all other points count as points of
+            other views.
         order, axes, splits: Results of :func:`build_tree`.
         first: First row.
         last: Last row, exclusive.

@@ -34,8 +34,8 @@ def region_sums(labels, pixels, depths, count, rows):
     return float(squares[0])
 
 
-# Writes by how much two errors grow if regions u and v merge. The first error is that of colour and depth, and the
-# second error is that of position times the compactness
+# Writes by how much two errors grow if regions u and v merge. The first error is the error of colour and depth, and the
+# second is the error of position times the compactness
 merge_growth = declare(
     "merge_growth", rows=f8("capacity", TREE_COLUMNS), u=i8(least=0, below="capacity"), v=i8(least=0, below="capacity"),
     depth_weight=f8(), compactness=f8(), growth=f8(2, out=True),
