@@ -27,8 +27,8 @@ NamedScene = tuple[Path, Path | None]  # a scene, and the named folder in which 
 MAX_FOLDERS = 100_000  # most folders in a row without a scene; a link into a system's folders leads to more
 SCENE_NAMES = {Path(place).parts[0] for place in (*PLY_PLACES, *TRAINED_PLACES)}
 SCENE_PARTS = SCENE_NAMES | {Path(place).parts[0] for place in IMAGE_PLACES}
-# A folder looks like a scene if a file or folder in it has one of _USUAL_NAMES, with or without .ply. A folder whose
-# own name is in _USUAL_NAMES is a part of a scene
+# A folder looks like a scene if a file or folder in it has one of _USUAL_NAMES, with or without .ply. A folder with a
+# name in _USUAL_NAMES is a part of a scene
 _USUAL_NAMES = {place.split("/")[0].removesuffix(".ply") for place in (*PLY_PLACES, *IMAGE_PLACES, *CAMERA_PLACES)}
 
 

@@ -142,7 +142,7 @@ class Job:
         return memory_bytes(self.num_gaussians, num_rest=self.num_rest)
 
     def find_files(self) -> SceneFiles:
-        """Find the files of the scene; SceneError if there are none."""
+        """Find the files of the scene, or raise SceneError if there are none."""
         places = {name: getattr(self, name) for name in PLACE_OPTIONS}
         return find_scene_files(Path(self.scene), **places, within=self.within)
 

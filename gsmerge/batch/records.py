@@ -81,7 +81,7 @@ def _read_result(line: Mapping[str, Any]) -> DoneResult:
 
 
 def _text(value: Any) -> str:
-    """Return a value that has to be text; TypeError for any other value."""
+    """Return a value that has to be text, or raise TypeError for any other value."""
     if not isinstance(value, str):
         raise TypeError
     return value
@@ -94,7 +94,7 @@ def record(status: str, scene: str, output: str, **facts: Any) -> dict[str, Any]
 
 
 def prepare_folder(folder: Path) -> None:
-    """Make the output folder and its file of records; SceneError if records cannot be written."""
+    """Make the output folder and its file of records, or raise SceneError if records cannot be written."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         records = folder / RECORDS

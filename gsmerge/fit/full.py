@@ -105,7 +105,7 @@ def score_fit(fit: FullFit) -> None:
 
 
 def renew_state(fit: FullFit) -> None:
-    """Add Gaussians, drop faint ones, or cut Gaussians at the edges of the views, if one of these is due.
+    """Add Gaussians, drop faint ones, or cut Gaussians at the edges of the views, if such a change is due.
 
     A change gives rows to other Gaussians, or turns the axes of a Gaussian, so the mean over the last steps begins
     anew. If some Gaussians are fixed, none are dropped or added, because the caller expects every Gaussian in its row.

@@ -70,7 +70,7 @@ def grow(state: FitState, masses: np.ndarray, count: int) -> tuple[FitState, np.
     is_half = np.zeros(len(x), bool)
     is_half[worst] = is_half[len(state.x) :] = True
     unsplit = ~is_half[: len(state.x)]
-    # the centre of a half's box and the unit of its size follow from its own parameters, not from its parent's
+    # the centre of a half's box and the unit of its size follow from the half's parameters, not from the parent's
     grown.x0[~is_half], grown.units[~is_half] = state.x0[unsplit], state.units[unsplit]
     for name in set(CARRIED) - {"x0", "units"}:
         getattr(grown, name)[:] = getattr(state, name)[parents]

@@ -192,13 +192,13 @@ def veil_gradients(splats: Splats, outside: Outside, view: int) -> Gradients:
     image_gradient = np.zeros_like(image)
     image_gradient[..., 0] = -weights * inverse_limits
     g = gradients_of(tiled, depths, image, transmittance, image_gradient, -weights, with_viewmat=False)
-    g.colors[:] = 0  # the colours drawn were depths, so these gradients mean nothing for colours
+    g.colors[:] = 0  # the colours drawn were depths, so the gradients mean nothing for colours
     min_gradient = 1e-9  # Gaussians with a smaller gradient are behind the limit, and should not gain opacity
     return g[np.flatnonzero(g.opacities > min_gradient)]
 
 
 def score_fog(splats: Splats, outside: Outside) -> float | None:
-    """Return the mean opacity, in [0, 1], of all pixels in which the input is empty; None without such pixels.
+    """Return the mean opacity, in [0, 1], of all pixels in which the input is empty, or None without empty pixels.
 
     At most about ``SCORED`` evenly spaced views from outside are drawn.
     """

@@ -118,7 +118,7 @@ class FitRun:
         return np.where(self.first_pixels[step.view][step.sample.pixels], weight, np.float32(0))
 
     def outside_view(self, step: int, progress: float) -> int | None:
-        """Return the index of the view from outside that is drawn after step ``step`` (from 1); None for no view."""
+        """Return the index of the view from outside to draw after step ``step`` (from 1), or None to draw none."""
         outside, rates = self.job.outside, self.job.options.tuning
         if outside is None or progress < rates.outside_from or step % rates.outside_every:
             return None
@@ -212,7 +212,7 @@ class Step:
     """What one step of a fit draws: a view, a background, a draw mode, and the Gaussians that take part."""
 
     number: int  # From 1
-    progress: float  # Share of the steps that come before this one
+    progress: float  # Share of the steps that come before this step
     mode: DrawMode
     view: int
     background: np.ndarray  # [3] float32

@@ -101,7 +101,7 @@ def _choose_fit(gaussians: Gaussians, job: FitJob) -> FitResult:
 
 
 def _better_of(photos: Photos, before: Gaussians, after: Gaussians, report: FitReport) -> FitResult:
-    """Return the Gaussians ``after`` the fit, or those ``before`` it if most photos became worse.
+    """Return the Gaussians ``after`` the fit, or the Gaussians ``before`` the fit if most photos became worse.
 
     If the Gaussians were already fitted, they can become worse, because steps of the default size scatter them. Whole
     photos are compared only if held-out patches gained less than ``CLOSE`` dB. A fit is not refused because of held-out

@@ -36,7 +36,7 @@ class Optimiser:
 
     @property
     def viewmats(self) -> np.ndarray | None:
-        """Poses ``[v,4,4]`` of the cameras, which the fit moves; None if cameras are fixed."""
+        """Poses ``[v,4,4]`` of the cameras that the fit moves, or None if cameras are fixed."""
         return None if self.poses is None else self.poses.viewmats
 
     def step(self, state: FitState, step: Step) -> float:

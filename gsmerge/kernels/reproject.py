@@ -65,7 +65,7 @@ def follow_pixels(points, viewmats, Ks, ids, tails, ends, before, keys, views, w
 def linearise(points, pixels, K, pose, jacobian, residuals):
     """Write the reprojection errors of a view's points, and their derivatives with respect to camera parameters.
 
-    ``residuals [2n]`` are the errors of all points to the right, then those downwards, in pixels. The columns of
+    ``residuals [2n]`` are the errors of all points to the right, then the errors downwards, in pixels. The columns of
     ``jacobian [2n,6+f]`` are derivatives with respect to the camera's rotation, its shift, and f intrinsics: the
     logarithm of the focal length (f = 1), or of both focal lengths (f = 2), and also the principal point (f = 4).
     """

@@ -32,9 +32,9 @@ def cross_view_stats(
     with the ``most`` views nearest to the view of the point, by default with all other views.
 
     Returns statistics ``[g,7]`` float32, scaled to about 1. Column 0 is the logarithm of the number of views that see
-    the point. Columns 1 to 3 are the shares, among the views that see the point, of those that have a surface at the
-    point, behind it, and in front of it. Columns 4 and 5 are the mean differences of colours and of relative depths,
-    and column 6 is the logarithm of the number of all views.
+    the point. Of the views that see the point, columns 1 to 3 are the shares with a surface at the point, behind the
+    point, and in front of it. Columns 4 and 5 are the mean differences of colours and of relative depths, and column 6
+    is the logarithm of the number of all views.
     """
     stats = np.zeros((len(means), NUM_STATS), np.float32)
     stats[:, -1] = math.log(len(cameras)) / 4

@@ -35,7 +35,7 @@ class Gradients:
     viewmat: Array | None  # [4,4] float64, last row 0; None if not requested
 
     def __getitem__(self, rows: Array) -> Gradients:
-        """Select the gradients of the Gaussians ``rows`` (mask or indices), and keep that of the view matrix."""
+        """Select the gradients of the Gaussians ``rows`` (mask or indices), and the gradient of the view matrix."""
         names = ("ids", "means", "quats", "scales", "opacities", "colors")
         return replace(self, **{name: np.ascontiguousarray(getattr(self, name)[rows]) for name in names})
 

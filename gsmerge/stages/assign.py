@@ -55,7 +55,7 @@ def find_owners(scene: Scene, groups: Groups) -> Owners:
     best = Owners(np.zeros(count, np.float32), np.full(count, -1, np.int32), np.full(count, -1, np.int32))
 
     def update_best(view: int, tiled: TiledView) -> None:
-        """Replace entries of ``best`` by superpixels of this view, where these have larger contributions."""
+        """Replace entries of ``best`` by superpixels of this view with larger contributions."""
         values, labels = view_owners(tiled, groups.labels[view], groups.counts[view])
         with lock:
             best_values, best_views = best.values[tiled.ids], best.views[tiled.ids]

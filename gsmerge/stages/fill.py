@@ -29,7 +29,7 @@ from gsmerge.types import Cameras, Gaussians
 
 # Chosen on seven training captures
 FILLED_SHARE = 0.03  # largest number of new Gaussians, as a share of the fitted ones
-FILL_LEVEL = 8  # width of a drawing's pixel, in pixels of the views; it is large, since what fills gaps is blurred
+FILL_LEVEL = 8  # width of a drawing's pixel, in pixels of the views; large, because new Gaussians are blurred
 FILL_MARGIN = 0.05  # margin that is added to each side of a drawing, as a share of its width or height
 # Gaps have a transmittance above the first number, and surfaces have a transmittance below the second one
 GAP_TRANSMITTANCE, SURFACE_TRANSMITTANCE = 0.1, 0.05

@@ -48,7 +48,7 @@ def _find_limit(gaussians: Gaussians, peaks: np.ndarray, photos: Photos) -> floa
     """Try some limits, and return the largest one that is not noticed, or 0 if all are noticed.
 
     A limit is noticed if a picture changes by more than ``ROUNDING`` without the Gaussians whose largest blending
-    weight, in ``peaks [n]``, is below this limit.
+    weight, in ``peaks [n]``, is below the limit.
     """
     start_limit = 0.02  # limit of the first trial
     # Limits up to `low` are not noticed, and limits from `high` on are noticed

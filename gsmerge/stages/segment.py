@@ -194,7 +194,7 @@ def _usable_depths(depths: np.ndarray, valid: np.ndarray) -> np.ndarray:
     usable = valid & np.isfinite(depths)
     positive = usable & (depths > 0)
     median = float(np.median(depths[positive])) if positive.any() else 1.0
-    depth_range = 1e3  # depths are clipped to at most this factor above or below the median
+    depth_range = 1e3  # largest factor by which a depth may be above or below the median
     clipped = np.clip(depths / median, 1 / depth_range, depth_range)
     return np.ascontiguousarray(np.where(usable, clipped, 0), np.float32)
 

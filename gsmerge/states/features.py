@@ -197,7 +197,7 @@ def _view_names(state: FeatureState | None, prepared: Prepared) -> tuple[str, ..
 
 
 def _check_world(state: FeatureState | None, scene: Scene, options: ExtendOptions) -> str:
-    """Compare the world of a scene with that of a state, both in the canonical frame; see :func:`compare_worlds`.
+    """Compare the world of a scene with the world of a state, both in the canonical frame; see :func:`compare_worlds`.
 
     Raises SceneError if the scene is in another world, unless the options allow this.
     """

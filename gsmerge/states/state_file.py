@@ -51,7 +51,7 @@ class State:
 
 
 def save_state(path: StrPath, state: State, *, overwrite: bool = False, mode: int = 0o666) -> None:
-    """Write a state to a file, completely or not at all; SceneError if the file exists or cannot be written.
+    """Write a state to a file, completely or not at all; raise SceneError if the file exists or cannot be written.
 
     ``mode`` has the most access rights that a new file may have; see :func:`gsmerge.io.atomic.common_mode`.
     """
@@ -95,7 +95,7 @@ def load_state(path: StrPath) -> State:
 
 
 def holds_features(path: Path) -> bool:
-    """Return whether a ``.gsm`` holds Feature Gaussians and not results; SceneError if the file cannot be read."""
+    """Return whether a ``.gsm`` holds Feature Gaussians and not results, or raise SceneError if it is unreadable."""
     return bool(read_header(path)["kind"] != SCENE)
 
 

@@ -89,8 +89,8 @@ def sum_cross_view(
 
     Args:
         colors: ``[g,3]`` float32 base colours minus 0.5.
-        own: ``[g]`` int64 own view of each point, with which it is not compared. Points with a number below 0 are
-            compared with all views.
+        own: ``[g]`` int64 view to which each point belongs, with which the point is not compared. Points with a number
+            below 0 are compared with all views.
         asked: ``[v,most]`` int32 views with which the points of each view are compared.
         width: Width of the views, pixels.
         height: Height of the views, pixels.

@@ -60,7 +60,7 @@ def merge_order(pairs, rows, depth_weight, compactness, max_extent):
         rows: ``[2·leaves,20]`` rows of the leaves, behind which the rows of merged regions are written.
         depth_weight: Weight of squared relative errors of depth, relative to squared differences of colours.
         compactness: Weight of squared distances in pixels, relative to squared differences of colours.
-        max_extent: Merges that make regions with a side of this many pixels come last.
+        max_extent: Merges come last if a side of the merged region has at least so many pixels.
 
     Returns:
         The parent ``[2·leaves-1]`` int32 of each leaf and merge, which is -1 at the root, and the height and the growth
