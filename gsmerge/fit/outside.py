@@ -104,7 +104,7 @@ def place_outside_views(scene: Scene, start: Gaussians, photos: Photos, options:
     limits = _find_limits(make_splats(sample), views, near, far)
     fog_weight = np.float32(np.clip(len(start) / (MANY_PER_PHOTO * len(photos)), LEAST_FOG_WEIGHT, 1.0))
     weights = fog_weight * np.where(np.isinf(limits), 1, np.where(limits > 0, VEIL_WEIGHT, 0)).astype(np.float32)
-    min_share = 0.005  # a picture counts if more than so large a share of it is empty or solid
+    min_share = 0.005  # a picture counts if more than min_share of its pixels are empty or solid
     ids = np.flatnonzero((limits > 0).mean((1, 2)) > min_share).tolist()
     return Outside(replace(views[ids], weights=weights[ids]), limits[ids], near[ids], far[ids]) if ids else None
 

@@ -13,7 +13,7 @@ from gsmerge.types import Cameras, Gaussians
 from gsmerge.values.arrays import ArrayFields
 
 SAMPLE_COST = 0.4  # time of a step on a quarter of the pixels, if one on all pixels takes 1; .3 to .6 on two captures
-HAZE = 0.05  # a result with more far fog than this gets a note, because a viewer shows it plainly
+HAZE = 0.05  # a result with more far fog gets a note, because a viewer shows such fog plainly
 
 
 @dataclass(frozen=True, eq=False, repr=False)

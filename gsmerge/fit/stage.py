@@ -22,8 +22,8 @@ from gsmerge.runtime.record import record_choices, stage
 from gsmerge.settings.fit import FitOptions
 from gsmerge.types import Decoded, Gaussians, PicturedScene
 
-CLOSE = 1.0  # if held-out patches gain less than this, in dB, whole photos decide whether a fit is accepted
-START = 0.57  # a run that grows starts with this share of its final number of Gaussians
+CLOSE = 1.0  # if held-out patches gain less than CLOSE dB, whole photos decide whether a fit is accepted
+START = 0.57  # a run that grows starts with the share START of its final number of Gaussians
 
 
 def fit_scene(

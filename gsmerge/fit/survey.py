@@ -18,7 +18,7 @@ from gsmerge.runtime.threads import in_turn
 from gsmerge.types import Cameras, Gaussians
 
 MOST_SCORED = 12  # a fit is scored on at most this many photos
-ENOUGH_PHOTOS = 6  # a survey needs no further photo of a Gaussian whose centre is inside so many photos
+ENOUGH_PHOTOS = 6  # a survey needs no more photos of a Gaussian whose centre is inside ENOUGH_PHOTOS
 # A photo is added to a survey if more than FEWER_SHARE of its Gaussians are inside fewer than ENOUGH_PHOTOS photos
 FEWER_SHARE = 0.03
 

@@ -23,8 +23,8 @@ Score = TypeVar("Score")
 
 LEAST_OPACITY = 1 / 255  # rasterizers draw no smaller opacity
 NEAR_PLANE = 0.01  # near plane of every render that is scored, in canonical units
-# Scenes of more Gaussians are rendered view by view, because a tiled view takes about as much memory as the Gaussians.
-# When scenes are rendered view by view, all threads share one view
+# Scenes of more than ERRORS_ONE_AT_A_TIME Gaussians are rendered view by view, because a tiled view takes about as much
+# memory as the Gaussians. When scenes are rendered view by view, all threads share one view
 ERRORS_ONE_AT_A_TIME = 400_000
 # Scored tiles are shifted by TILE_STEP columns, a prime, from one line of tiles to the next. At least LEAST_TILES of a
 # view are scored, so small views are scored whole. With 48 tiles, a PSNR gain on six views of 256 x 480 pixels seemed

@@ -16,7 +16,7 @@ from gsmerge.stages.sky import sky
 from gsmerge.types import Cameras, Gaussians
 
 BOX_QUANTILES = (1, 99)  # the scene's box reaches from the first to the second percentile of positions on each axis
-FLOATER_NEIGHBORS = 8  # an isolated Gaussian touches none of this many nearest Gaussians
+FLOATER_NEIGHBORS = 8  # an isolated Gaussian touches none of its FLOATER_NEIGHBORS nearest Gaussians
 # A fit may leave Gaussians that hang across the scene like curtains. The second largest scale of such a curtain exceeds
 # the share CURTAIN[0] of half the diagonal of the scene's box, or its largest scale exceeds the share CURTAIN[1] of
 # half the diagonal. The same scale, second largest or largest, also exceeds CURTAIN_FACTOR times its median over all

@@ -38,7 +38,7 @@ GAP_TRANSMITTANCE, SURFACE_TRANSMITTANCE = 0.1, 0.05
 WINDOW_SHARE, NEARER_SHARE = 0.08, 0.85
 MOST_FILLED_VIEWS = 64  # most views of a scene that is filled, because the time grows with their square
 DEPTH_FACTORS = (1, 1.06, 1.15, 1.3, 1.6, 2.2)  # depths that are tried for a new Gaussian, in depths of the surface
-BESIDE_PIXELS = 2  # a new Gaussian reaches at most so many pixels beyond the pixel that it fills
+BESIDE_PIXELS = 2  # a new Gaussian reaches at most BESIDE_PIXELS beyond the pixel that it fills
 FRONT_SHARE = 0.98  # a Gaussian hides a surface if its depth is less than this share of the surface's depth
 
 

@@ -21,7 +21,7 @@ from gsmerge.raster.photos import NEAR_PLANE
 from gsmerge.raster.weights import apply_transposed, view_weights
 from gsmerge.types import Cameras, Gaussians
 
-GRADIENT_PIXELS = 480.0  # gradients are those of a photo with this many pixels on its longer side
+GRADIENT_PIXELS = 480.0  # gradients are measured in a photo with GRADIENT_PIXELS on its longer side
 # Blue sky is brighter than DARK_SKY. White sky is brighter than WHITE_SKY, and has less chroma than GREY_SKY
 DARK_SKY, WHITE_SKY, GREY_SKY = 0.35, 0.75, 0.12
 FAR_RATIO = 3.0  # the sky is more than FAR_RATIO times as far away as the rest

@@ -57,7 +57,7 @@ class Compactor:
     at most ``max_views`` views. The method ``compact`` makes results from the Gaussians and views that the state keeps.
     With ``recipe="paper"`` the state keeps Feature Gaussians instead, which are matched and merged across batches
     (paper section 4.5, "Online reconstruction"). The method ``decode`` makes results of these Feature Gaussians with
-    any K, which is the number of Gaussians for each.
+    any K, which is the number of Gaussians made of each.
 
     Args:
         **settings: Settings of the batches by name, as in ``Compactor(budget="3%", max_views=16)``. These are the
