@@ -27,20 +27,26 @@ NamedScene = tuple[Path, Path | None]  # a scene, and the named folder in which 
 MAX_FOLDERS = 100_000  # most folders in a row without a scene; a link into a system's folders leads to more
 SCENE_NAMES = {Path(place).parts[0] for place in (*PLY_PLACES, *TRAINED_PLACES)}
 SCENE_PARTS = SCENE_NAMES | {Path(place).parts[0] for place in IMAGE_PLACES}
-# A folder looks like a scene if a file or folder in it has one of _USUAL_NAMES, with or without .ply. A folder whose
-# own name is in _USUAL_NAMES is a part of a scene
+# A folder looks like a scene if a file or folder in it has one of _USUAL_NAMES, with or without .ply. A folder with a
+# name in _USUAL_NAMES is a part of a scene
 _USUAL_NAMES = {place.split("/")[0].removesuffix(".ply") for place in (*PLY_PLACES, *IMAGE_PLACES, *CAMERA_PLACES)}
 
 
 def scene_plys(scene: Path) -> list[Path]:
-    """List the files of Gaussians of a scene, which is a file or a folder; empty if the folder cannot be read."""
+    """List the files of Gaussians of a scene, which is a file or a folder.
+
+    The list is empty if the folder cannot be read.
+    """
     with suppress(SceneError, OSError):
         return list_plys(scene) if os.path.isdir(scene) else [scene]
     return []
 
 
 def main_file(scene: Path) -> Path:
-    """Return the file that identifies a scene; its folder if several files could, or if the folder cannot be read."""
+    """Return the file that identifies a scene.
+
+    The folder of the scene is returned if several files could identify the scene, or if the folder cannot be read.
+    """
     if not os.path.isdir(scene):
         return scene
     with suppress(OSError):  # whoever reads the scene reports the reason
@@ -108,7 +114,10 @@ def find_named_scenes(arguments: Sequence[str], out: Path, lookalikes: list[str]
 
 
 def _require_some(scenes: Iterator[NamedScene], argument: str, where: str) -> Iterator[NamedScene]:
-    """Yield the scenes of an argument; SceneError without any. ``where`` says in the error where they were expected."""
+    """Yield the scenes of an argument.
+
+    Raises SceneError without any scene. The text ``where`` tells the user where scenes were expected.
+    """
     first_scene = next(scenes, None)
     if first_scene is None:
         raise SceneError(argument, f"expected scenes {where}, found none", _remedy(Path(argument)))
@@ -117,7 +126,7 @@ def _require_some(scenes: Iterator[NamedScene], argument: str, where: str) -> It
 
 
 def _remedy(folder: Path) -> str:
-    """Return what the user can do about a folder without a scene; empty if the path is no folder."""
+    """Return what the user can do about a folder without a scene, or an empty text if the path is no folder."""
     if not os.path.isdir(folder):
         return ""
     file = next(iter(list_plys(folder)), None)
@@ -174,7 +183,7 @@ class _Search:
 def _is_packed(path: Path) -> bool:
     """Return whether a file is a zip archive with Gaussians.
 
-    Such an archive counts as a scene, so that its reader refuses it.
+    An archive with Gaussians counts as a scene, so that the user gets an error about it.
     """
     if path.suffix != ".zip" or path.with_suffix("").exists():  # an archive beside its unpacked folder is not needed
         return False
@@ -186,8 +195,8 @@ def _is_packed(path: Path) -> bool:
 def _other_scenes(folder: Path, names: list[str]) -> list[Path]:
     """List the files that are scenes, in a folder that is no scene itself.
 
-    ``names`` are the names of the files and folders in it. If the folder cannot be read any more, it is returned, and
-    its reader reports the reason.
+    ``names`` are the names of the files and folders in this folder. If the folder cannot be read any more, the list has
+    the folder, and its reader reports the reason.
     """
     if SCENE_NAMES.isdisjoint(names) and not any(name.endswith(SCENE_SUFFIXES) for name in names):
         return []
@@ -214,7 +223,7 @@ def _is_scene(folder: Path, names: list[str]) -> bool:
 
 
 def _match_pattern(pattern: str, search: _Search) -> Iterator[NamedScene]:
-    """Yield the scenes that match a pattern, and those in folders that match; ``**`` passes through no links."""
+    """Yield the scenes that match a pattern, and the scenes in folders that match; ``**`` passes through no links."""
     anchor, named = Path(pattern).anchor, Path(pattern).parts
     paths = Path(anchor).glob(os.path.relpath(pattern, anchor) if anchor else pattern)
     # Hidden files and folders match only if the pattern has their names

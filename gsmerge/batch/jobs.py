@@ -142,7 +142,7 @@ class Job:
         return memory_bytes(self.num_gaussians, num_rest=self.num_rest)
 
     def find_files(self) -> SceneFiles:
-        """Find the files of the scene; SceneError if there are none."""
+        """Find the files of the scene, or raise SceneError if there are none."""
         places = {name: getattr(self, name) for name in PLACE_OPTIONS}
         return find_scene_files(Path(self.scene), **places, within=self.within)
 
@@ -195,7 +195,7 @@ def find_jobs(
 def _find_clash(
     job: Job, out: Path, scenes_by_output: Mapping[str, Sequence[str]], inputs: Collection[str]
 ) -> str | None:
-    """Return why a result cannot have its name; None if no other result and no scene has this name."""
+    """Return why a result cannot have its name, or None if no other result and no scene has the name."""
     for name in job.outputs:
         scenes = scenes_by_output[os.path.normcase(name)]
         if len(scenes) > 1:

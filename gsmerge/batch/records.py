@@ -30,7 +30,7 @@ class DoneResult:
     unmet: str | None = None  # why the result misses its target, or None
 
     def holds(self, folder: Path, key: str) -> bool:
-        """Return whether the result is up to date: it has the ``key``, and its files in ``folder`` are unchanged."""
+        """Return whether a result has the ``key``, and its files in ``folder`` are unchanged."""
         if self.key != key or not self.files:
             return False
         try:
@@ -44,7 +44,7 @@ class DoneResult:
 
 @dataclass
 class RecordIndex:
-    """The results that are done according to the records of a folder."""
+    """Results in a folder that are done, according to the records of the folder."""
 
     folder: Path
     end: int = 0  # byte up to which the records have been read
@@ -71,14 +71,17 @@ class RecordIndex:
 
 
 def _read_result(line: Mapping[str, Any]) -> DoneResult:
-    """Return the result of a record; KeyError, TypeError or AttributeError if the record is damaged."""
+    """Return the result of a record.
+
+    A damaged record raises KeyError, TypeError or AttributeError.
+    """
     files = [{"path": _text(file["path"]), "sha256": file["sha256"], "bytes": file["bytes"]} for file in line["files"]]
     doubts, unmet = tuple(map(_text, line.get("doubts", ()))), _text(line.get("unmet") or "") or None
     return DoneResult(_text(line["key"]), files, _text(line["scene"]), doubts, unmet)
 
 
 def _text(value: Any) -> str:
-    """Return a value that has to be text; TypeError for any other value."""
+    """Return a value that has to be text, or raise TypeError for any other value."""
     if not isinstance(value, str):
         raise TypeError
     return value
@@ -91,7 +94,7 @@ def record(status: str, scene: str, output: str, **facts: Any) -> dict[str, Any]
 
 
 def prepare_folder(folder: Path) -> None:
-    """Make the output folder and its file of records; SceneError if records cannot be written."""
+    """Make the output folder and its file of records, or raise SceneError if records cannot be written."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         records = folder / RECORDS

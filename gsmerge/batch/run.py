@@ -1,8 +1,8 @@
 """Run a batch: make the result of every job that is not done, and record how each ended.
 
 The run may be killed at any moment. A result is written completely or not at all, and its record follows at once. A
-process that is killed in between leaves a result without a record. A file that marks the result as begun, and that is
-written before it, shows that a batch made it.
+process that is killed in between leaves a result without a record. Before each result, a file is written that marks the
+result as begun. This file shows that a batch made the result.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ def _record_failure(job: Job, folder: Path, reason: str) -> dict[str, Any]:
 def refusal(
     job: Job, folder: Path, known: DoneResult | None, key: str, *, overwrite: bool, begun: bool = False
 ) -> str | None:
-    """Return why a result must not be made; None if it can be made.
+    """Return why a result must not be made, or None if the result can be made.
 
     ``known`` is the recorded result of this name, and ``key`` is the key of the result to make. ``begun`` is True if a
     killed run may have left files without a record.
@@ -235,7 +235,7 @@ def _make_result(job: Job, run: Run, mark: Path) -> dict[str, Any]:
 
 @lru_cache(maxsize=1)
 def read_run_index(folder: Path) -> RecordIndex:
-    """Return the index of a folder's records; a process keeps it for all its jobs of a run."""
+    """Return the index of a folder's records, which a process keeps for all its jobs."""
     return RecordIndex(folder)
 
 
@@ -262,11 +262,11 @@ def _remove_unfinished_files(job: Job, run: Run, mark: Path) -> None:
 
 @contextmanager
 def lock_result(folder: Path, output: str, *, wait: bool) -> Iterator[Path | None]:
-    """Lock a result against other processes while the block runs; SceneError if it cannot be locked.
+    """Lock a result against other processes while the block runs.
 
-    Yields the path of the file that marks the result as begun. If another process has locked the result, the call waits
-    for it, or yields None without ``wait``. A folder that cannot be written needs no lock, because no result is made in
-    it.
+    Raises SceneError if the result cannot be locked. Yields the path of the file that marks the result as begun. If
+    another process has locked the result, the call waits for it, or yields None without ``wait``. A folder that cannot
+    be written needs no lock, because no result is made in it.
     """
     name = hashlib.sha256(output.encode(errors="surrogateescape")).hexdigest()[:32]
     lock = lock_file(folder / f".batch-{name}.lock", wait=wait) if os.access(folder, os.W_OK) else nullcontext(True)

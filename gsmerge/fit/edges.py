@@ -30,10 +30,10 @@ from gsmerge.types import Cameras
 MARGIN = 2.0
 ROWS = 16384  # Gaussians per task
 REACH = 2.0  # a Gaussian ends at this many standard deviations, as in kernels/gaussians/edges.c
-SOFT = 0.01  # a Gaussian is split if its soft border is wider than this, as a share of the width of the view
+SOFT = 0.01  # a Gaussian is split if its soft border is wider than the share SOFT of the view
 FALL = 1.69  # standard deviations over which the opacity of an opaque Gaussian falls from .9 to .1: its soft border
-# A Gaussian is split if its opacity at the edge is above this. Fainter Gaussians are haze in front of the scene. A
-# split of these fainter Gaussians would change the photos by up to 1 dB, and hardly narrow the soft rim of the scene
+# A Gaussian is split only if its opacity at the edge is above SHOWN. Fainter Gaussians are haze in front of the scene.
+# Splits of haze would change the photos by up to 1 dB, and hardly narrow the soft rim of the scene
 SHOWN = 0.2
 
 

@@ -52,8 +52,8 @@ class FitState:
     def view_colors(self) -> np.ndarray | None:
         """Return the colours to draw, or None if colours depend on the direction of view.
 
-        If this returns None, the rasterizer computes the colours from ``splats.sh0``, which is updated here, and
-        ``splats.shN``.
+        If colours depend on the direction, base colours are written to ``splats.sh0``, and the rasterizer computes
+        colours from ``splats.sh0`` and ``splats.shN``.
         """
         self.update_harmonics()
         return self.colors if self.splats.shN.shape[1] == 0 else None

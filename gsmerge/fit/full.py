@@ -39,7 +39,7 @@ def fit_full(
     Args:
         gaussians: The n Gaussians to start from.
         run: Photos and options.
-        survey: Survey of the Gaussians; if None, it is made here.
+        survey: Survey of the Gaussians, or None to make a new survey.
         fixed: ``[n]`` bool, true for Gaussians that must not change; if None, all may change.
 
     Returns:
@@ -105,10 +105,10 @@ def score_fit(fit: FullFit) -> None:
 
 
 def renew_state(fit: FullFit) -> None:
-    """Add Gaussians, drop faint ones, or cut Gaussians at the edges of the views, if one of these is due.
+    """Add Gaussians, drop faint ones, or cut Gaussians at the edges of the views, if such a change is due.
 
-    After such a change a row may be another Gaussian, or have other axes, so the mean over the last steps begins anew.
-    If some Gaussians are fixed, none are dropped or added, because the caller expects every Gaussian in its row.
+    A change gives rows to other Gaussians, or turns the axes of a Gaussian, so the mean over the last steps begins
+    anew. If some Gaussians are fixed, none are dropped or added, because the caller expects every Gaussian in its row.
     """
     job, options = fit.run.job, fit.run.job.options
     if not options.grows or not fit.reaches(GROWTH, *CLEARS, *CUTS):
@@ -126,7 +126,7 @@ def take_step(fit: FullFit) -> None:
     """Take a step on a photo, and also a step on a view from outside if one is due; count the step in ``fit``."""
     run, progress = fit.run, fit.progress
     step = fit.schedule.draw(fit.step + 1, progress, len(fit.state.x))
-    if fit.reaches(run.half_part):  # from here on steps draw whole photos, whose errors differ from those of samples
+    if fit.reaches(run.half_part):  # later steps draw whole photos, whose errors differ from errors of samples
         fit.error = RecentMean()
     fit.error.add(fit.optimiser.step(fit.state, step))
     outside_view = run.outside_view(step.number, progress)

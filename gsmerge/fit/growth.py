@@ -17,17 +17,16 @@ from gsmerge.runtime.threads import in_turn
 OFFSET = 0.7
 FADED = 0.005  # fainter Gaussians are dropped, because their halves would be fainter than 1 / 255 and not be drawn
 FAINT = 0.02  # late in a run, fainter Gaussians only fade away; without them the run takes .9 of the time
-# Most Gaussians after a growth, as a multiple of those that are left when the growth begins. The usual number of
-# Gaussians is a share of all pixels, which is far more than surfaces need that many views show. If many views show the
-# same surfaces, most Gaussians of the start are hidden, and halves of halves are smaller than the details of the
-# photos, so most halves of halves fade. Compared with growth without a limit, this limit gains .1 to .2 dB in real
+# Largest factor by which a growth may raise the number of Gaussians. The usual number of Gaussians is a share of all
+# pixels, which is more than surfaces need if many views show them. Gaussians that are split too often become smaller
+# than the details of the photos, and fade. Compared with growth without a limit, MOST_GROWTH gains .1 to .2 dB in real
 # scenes of 60 and 84 views, and takes .7 to .8 of the time. A rendered room loses .06 dB if MOST_GROWTH is 4 instead of
-# 8. Scenes of up to a dozen views never grow by this factor
+# 8. Scenes of up to a dozen views never grow by MOST_GROWTH
 MOST_GROWTH = 8
 
 
 def drop_faint(state: FitState, least: float) -> FitState:
-    """Drop the Gaussians with an opacity below ``least``; in a faint scene, at most the fainter half of them."""
+    """Drop the Gaussians with an opacity below ``least``, but at most the fainter half of all Gaussians."""
     opacities = state.splats.opacities
     return state[opacities >= min(least, float(lower_median(opacities)))] if len(opacities) else state
 
@@ -37,9 +36,9 @@ def grow_to(
 ) -> FitState:
     """Drop Gaussians with an opacity below ``least``, then split others until there are ``count``.
 
-    The number of Gaussians that remain after the drop grows at most by the factor ``most_growth``; None sets no limit.
-    The result also has fewer Gaussians than ``count`` if no photo shows a Gaussian that could be split. The errors of
-    the half-size photos ``half`` decide which Gaussians are split.
+    The number of Gaussians after the drop grows at most by the factor ``most_growth``; None sets no limit. The result
+    also has fewer Gaussians than ``count`` if no photo shows a Gaussian that could be split. The errors of the
+    half-size photos ``half`` decide which Gaussians are split.
     """
     state = drop_faint(state, least)
     count = count if most_growth is None else min(count, most_growth * len(state.x))
@@ -71,7 +70,7 @@ def grow(state: FitState, masses: np.ndarray, count: int) -> tuple[FitState, np.
     is_half = np.zeros(len(x), bool)
     is_half[worst] = is_half[len(state.x) :] = True
     unsplit = ~is_half[: len(state.x)]
-    # the centre of a half's box and the unit of its size follow from its own parameters, not from its parent's
+    # the centre of a half's box and the unit of its size follow from the half's parameters, not from the parent's
     grown.x0[~is_half], grown.units[~is_half] = state.x0[unsplit], state.units[unsplit]
     for name in set(CARRIED) - {"x0", "units"}:
         getattr(grown, name)[:] = getattr(state, name)[parents]
@@ -108,7 +107,7 @@ def fade_halves(logits: np.ndarray) -> np.ndarray:
 def error_masses(state: FitState, half: Photos) -> np.ndarray:
     """Return the error mass ``[n]`` of each Gaussian: blending weight times absolute error, summed over all pixels.
 
-    The pixels are those of the half-size photos ``half``. Errors are multiplied by the importance of their pixels.
+    The half-size photos ``half`` give the pixels. Errors are multiplied by the importance of their pixels.
     """
 
     def view_masses(view: int) -> np.ndarray:

@@ -3,8 +3,8 @@
 Photos do not show the space between their fields of view, nor the space close to other cameras. A fit fills spaces that
 no photo shows with large Gaussians. A viewer who steps back sees these large Gaussians as fog where the input is empty,
 and as veils in front of the input's surfaces. To remove fog and veils, some steps of a fit draw the Gaussians from
-cameras behind, beside, above and below those of the photos, and compare their opacities and depths with those of the
-input.
+cameras behind, beside, above and below the photos. The opacities and depths in these views are compared with renders of
+the input.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from gsmerge.settings.fit import FitOptions
 from gsmerge.types import Cameras, Gaussians, Scene
 
 # Least and largest step back as a share of a view's median depth, rotation to the sides about the middle of the view in
-# degrees, and rotation up or down in degrees. Cameras that do not step back would see the same as new views between the
-# photos, in which a fit has to fill gaps
+# degrees, and rotation up or down in degrees. Without a step back, cameras would see what new views between the photos
+# see, in which a fit has to fill gaps
 STEP_BACK_LOW, STEP_BACK_HIGH = (0.4, -35.0, -25.0), (1.6, 35.0, 25.0)
 # The multiples of EVEN, modulo one, fill a cube evenly, whatever the number of multiples (the R sequence of Roberts
 # 2018)
@@ -36,11 +36,11 @@ EVEN = np.array([0.8191725134, 0.6710436067, 0.5497004779])
 PLACES = 42  # largest number of views from outside, if there are not more photos; then one for each photo
 DEPTH_GAUSSIANS = 2000  # the depths of views are measured on at least this many Gaussians, or on all if there are fewer
 # The views from outside are drawn from a sample of the input. The sample has GAUSSIANS_PER_PHOTO Gaussians for each
-# photo, but at most for PLACES photos, because more photos do not make the pictures larger
+# photo, but counts at most PLACES photos, because more photos do not make the pictures larger
 GAUSSIANS_PER_PHOTO = 4000
 OUTSIDE_NEAR_PLANE = 0.25  # depth of the near plane, as a share of the median depth of a view
-# Depths are clipped to at most FAR_FACTOR times their quantile FAR_QUANTILE, because a Gaussian that is much too far
-# away would change the mean depth of its pixels
+# Depths are clipped to at most FAR_FACTOR times their quantile FAR_QUANTILE, because a single Gaussian far behind the
+# scene would change the mean depth of its pixels
 FAR_QUANTILE, FAR_FACTOR = 0.98, 4.0
 # A pixel of the input is empty below EMPTY_OPACITY, and shows a surface above SOLID_OPACITY
 EMPTY_OPACITY, SOLID_OPACITY = 0.15, 0.9
@@ -51,9 +51,9 @@ RIM_SHARE = 0.04
 # is less than the limit of its depth by more than the share VEILED_LOSS of this limit
 VEILED_LOSS = 0.15
 # The weight of fog in the loss is 1 if the start has at least MANY_PER_PHOTO Gaussians for each photo. If a start has
-# fewer Gaussians, each one is larger and reaches from the borders of photos into empty space. With a weight of 1 such
-# large Gaussians would vanish, although the photos show them, so a start with fewer Gaussians gets a smaller weight of
-# fog, but at least LEAST_FOG_WEIGHT. VEIL_WEIGHT is the weight of veils relative to fog
+# fewer Gaussians, each one is larger and reaches from the borders of photos into empty space. With a fog weight of 1,
+# the large Gaussians would vanish, although photos show them. So fewer Gaussians mean a smaller weight of fog, but at
+# least LEAST_FOG_WEIGHT. VEIL_WEIGHT is the weight of veils relative to fog
 MANY_PER_PHOTO, LEAST_FOG_WEIGHT, VEIL_WEIGHT = 1000, 0.15, 30
 OUTSIDE_LEVEL = 3  # width of a pixel of the pictures, in pixels of a photo: 2 leaves as much fog, 4 a fifth more
 LEAST_WIDTH = 64  # least width of the pictures, pixels
@@ -85,10 +85,10 @@ class Outside:
 def place_outside_views(scene: Scene, start: Gaussians, photos: Photos, options: FitOptions) -> Outside | None:
     """Place views outside of the capture for a fit, and draw the scene in them to find the limits of depths.
 
-    The cameras of these views are the cameras of ``photos``, stepped back and rotated. Pictures are a third as wide as
-    the photos, but at least ``LEAST_WIDTH`` pixels. If the scene has no Gaussians, as when blocks are joined, the
-    ``start`` of the fit is drawn instead. Returns None if the fit has no steps for views from outside, or if in every
-    view too few pixels would count.
+    Each camera is a camera of ``photos``, stepped back and rotated. Pictures are a third as wide as the photos, but at
+    least ``LEAST_WIDTH`` pixels. If the scene has no Gaussians, as when blocks are joined, the ``start`` of the fit is
+    drawn instead. Returns None if the fit has no steps for views from outside, or if every view has too few pixels that
+    count.
     """
     num_steps = math.ceil(options.steps * (1 - options.tuning.outside_from) / options.tuning.outside_every)
     if num_steps == 0:  # steps on views from outside
@@ -104,7 +104,7 @@ def place_outside_views(scene: Scene, start: Gaussians, photos: Photos, options:
     limits = _find_limits(make_splats(sample), views, near, far)
     fog_weight = np.float32(np.clip(len(start) / (MANY_PER_PHOTO * len(photos)), LEAST_FOG_WEIGHT, 1.0))
     weights = fog_weight * np.where(np.isinf(limits), 1, np.where(limits > 0, VEIL_WEIGHT, 0)).astype(np.float32)
-    min_share = 0.005  # a picture counts if more than this share of it is empty or solid
+    min_share = 0.005  # a picture counts if more than min_share of its pixels are empty or solid
     ids = np.flatnonzero((limits > 0).mean((1, 2)) > min_share).tolist()
     return Outside(replace(views[ids], weights=weights[ids]), limits[ids], near[ids], far[ids]) if ids else None
 
@@ -112,7 +112,8 @@ def place_outside_views(scene: Scene, start: Gaussians, photos: Photos, options:
 def _depth_range(points: np.ndarray, cameras: Cameras, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the depth of the near plane and the largest depth of each of ``count`` views from outside.
 
-    A view has the depths of ``points [n,3]`` in the camera from which it steps back. These are ``cameras`` in turn.
+    The depths of a view are the depths of ``points [n,3]`` in the camera from which the view steps back. Views step
+    back from each of ``cameras`` in turn.
     """
     depths = [depths_inside(points, cameras[[view]]) for view in range(min(count, len(cameras)))]
     median, far = np.resize([quantiles(view_depths, (0.5, FAR_QUANTILE)) for view_depths in depths], (count, 2)).T
@@ -123,7 +124,7 @@ def _find_limits(splats: Splats, views: Photos, near: np.ndarray, far: np.ndarra
     """Draw the Gaussians of the input in v views from outside; return the limits ``[v,h,w]`` of :class:`Outside`."""
 
     def view_limits(view: int) -> np.ndarray:
-        """Return the depth of the surface in each pixel; inf if the pixel is empty, 0 if it is partly transparent."""
+        """Return the depth of the surface in each pixel, inf for empty pixels, and 0 for partly transparent pixels."""
         depths, transmittance = blend_depths(tile_view(splats, **views.camera(view), near=near[view]), far[view])
         opacities = 1 - transmittance
         limits = np.where(opacities > SOLID_OPACITY, depths, 0)
@@ -159,7 +160,7 @@ def outside_cameras(
 
 
 def mark_empty(opacities: np.ndarray) -> np.ndarray:
-    """Return a mask ``[h,w]`` of the pixels in which the ``opacities [h,w]`` are empty, without a rim beside others."""
+    """Return a mask ``[h,w]`` of pixels with ``opacities [h,w]`` below EMPTY_OPACITY, less a rim at their borders."""
     side = 2 * round(RIM_SHARE * opacities.shape[1]) + 1
     empty = cv2.erode((opacities < EMPTY_OPACITY).astype(np.uint8), np.ones((side, side), np.uint8))
     return np.asarray(empty, bool)
@@ -191,13 +192,13 @@ def veil_gradients(splats: Splats, outside: Outside, view: int) -> Gradients:
     image_gradient = np.zeros_like(image)
     image_gradient[..., 0] = -weights * inverse_limits
     g = gradients_of(tiled, depths, image, transmittance, image_gradient, -weights, with_viewmat=False)
-    g.colors[:] = 0  # the colours drawn were depths, so these gradients mean nothing for colours
+    g.colors[:] = 0  # the colours drawn were depths, so the gradients mean nothing for colours
     min_gradient = 1e-9  # Gaussians with a smaller gradient are behind the limit, and should not gain opacity
     return g[np.flatnonzero(g.opacities > min_gradient)]
 
 
 def score_fog(splats: Splats, outside: Outside) -> float | None:
-    """Return the mean opacity, in [0, 1], of all pixels in which the input is empty; None without such pixels.
+    """Return the mean opacity, in [0, 1], of all pixels in which the input is empty, or None without empty pixels.
 
     At most about ``SCORED`` evenly spaced views from outside are drawn.
     """

@@ -24,9 +24,10 @@ HIDDEN_WEIGHT = np.float32(1e-9)  # weight of pixels that do not count, because 
 
 
 def fit_photos(scene: PicturedScene, options: FitOptions, views: Sequence[int] | None = None) -> tuple[Photos, ...]:
-    """Return the photos of ``views`` (None: all) at full size, at half size, and larger if ``photo_scale`` is above 1.
+    """Return the photos at full size, at half size, and larger if ``photo_scale`` is above 1.
 
-    The larger size is recorded, and a note says that it takes time.
+    The photos belong to ``views``, or to all views if ``views`` is None. The larger size is recorded, and a note says
+    that it takes time.
     """
     views = range(len(scene)) if views is None else views
     photos = _with_empty(scene_photos(scene), scene)[views], _with_empty(scene_photos(scene, 2), scene)[views]
@@ -110,8 +111,8 @@ def large_photos(scene: Scene, scale: float) -> Photos:
 def training_weights(photos: Photos, share: float, seed: int) -> list[np.ndarray]:
     """Return the weights ``[h,w]`` float32 of the pixels of each view in training: 0 on held-out patches.
 
-    ``share`` is the share of the patches that is held out. Outside of held-out patches the weights are those of the
-    photo. Pixels with a weight below 1 are not held out, and a weight of 0 is replaced by ``HIDDEN_WEIGHT``.
+    The share ``share`` of the patches is held out. Outside of held-out patches, pixels have the weights of the photo.
+    Pixels with a weight below 1 are not held out, and a weight of 0 is replaced by ``HIDDEN_WEIGHT``.
     """
     return [training_weight(photos, view, share, seed) for view in range(len(photos))]
 
@@ -148,14 +149,14 @@ def _counting_patches(photos: Photos, view: int, size: int) -> np.ndarray:
 
 
 def reduced(weights: list[np.ndarray], photos: Photos) -> list[np.ndarray]:
-    """Return weights for half-size ``photos``: those of every second pixel of the full-size ``weights``."""
+    """Return weights for half-size ``photos``, from every second pixel of the full-size ``weights``."""
     return [np.ascontiguousarray(weight[::2, ::2][: photos.height, : photos.width]) for weight in weights]
 
 
 def holdout_psnr(images: Sequence[np.ndarray], photos: Photos, weights: list[np.ndarray], min_gain: float) -> float:
     """Return the PSNR (dB) of renders on the held-out patches, where ``weights [h,w]`` are 0.
 
-    The exposures of renders are adapted to those of the photos, if any of them differ by the factor ``min_gain``.
+    Renders are brought to the exposures of their photos, if some exposure differs by the factor ``min_gain``.
     """
     views = range(len(photos))
     clipped = parallel_map(lambda view: np.clip(images[view], 0, 1), views)

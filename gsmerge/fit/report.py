@@ -13,7 +13,7 @@ from gsmerge.types import Cameras, Gaussians
 from gsmerge.values.arrays import ArrayFields
 
 SAMPLE_COST = 0.4  # time of a step on a quarter of the pixels, if one on all pixels takes 1; .3 to .6 on two captures
-HAZE = 0.05  # a result with more far fog than this gets a note, because a viewer shows it plainly
+HAZE = 0.05  # a result with more far fog gets a note, because a viewer shows such fog plainly
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -27,7 +27,8 @@ class FitReport(ArrayFields):
     holdout_after: float  # The same after the fit
     stopped: str  # Why the fit ended
     viewmats: np.ndarray | None = None  # [v,4,4] poses after the fit; None if cameras were fixed
-    # Mean opacity, in [0, 1], that the result shows from outside where the input is empty; None if it is nowhere empty
+    # Mean opacity, in [0, 1], of the result in views from outside, over all pixels where the input is empty; None
+    # without empty pixels
     fog: float | None = None
     # [n] for each Gaussian of the result, the row of the Gaussian at the start from which it comes; None if unknown
     origins: np.ndarray | None = field(default=None, compare=False)

@@ -39,8 +39,8 @@ LARGE_STEPS = (0, 2)
 # The steps use the draw modes one after the other. A mode is the size (0 full, 1 half), the variance of the low-pass
 # filter as a share of the variance in viewers, and whether small Gaussians are made fainter to offset the low-pass, as
 # some viewers do. The low-pass of a viewer is smaller relative to the scene from near by, and larger from afar.
-# Gaussians that are fitted to one mode alone look thin or fat in the other modes (Mip-Splatting, Yu et al. 2024). The
-# first steps have several modes too, because these steps decide the sizes of Gaussians
+# Gaussians that are fitted to one mode alone look thin or fat in the other modes (Mip-Splatting, 2024). The first steps
+# have several modes too, because the sizes of Gaussians are decided early
 FIRST_MODES = (0, 1.0, False), (0, 0.25, False), (0, 1.0, False), (1, 1.0, False)
 DRAW_MODES = (
     (0, 1.0, True), (0, 1.0, False), (0, 0.25, False), (1, 1.0, False),
@@ -74,7 +74,7 @@ class FitJob:
     region: Region | None = None  # Region that no centre may leave; None for no limit
 
     def scored_photos(self, size: int) -> Photos:
-        """Return the photos that a result is scored on if none are held out; ``size`` is that of :class:`DrawMode`."""
+        """Return the photos that a result is scored on if none are held out; :class:`DrawMode` explains ``size``."""
         photos = self.photos[size]
         return photos[range(len(photos))[: self.num_scored]]
 
@@ -86,7 +86,7 @@ class DrawMode:
     size: int  # Index of the size among the photos of the job: 0 full, 1 half, 2 larger
     eps2d: float  # Variance of the low-pass filter, in squared pixels of this size
     antialiased: bool = False  # True to make small Gaussians fainter, because the low-pass widens them
-    stride: int = 1  # Distance from one drawn pixel to the next; those in between are left out
+    stride: int = 1  # Distance from one drawn pixel to the next; pixels in between are left out
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,14 +108,17 @@ class FitRun:
     first_pixels: tuple[np.ndarray, ...] | None = None
 
     def weight(self, step: Step) -> np.ndarray:
-        """Return the weights ``[h,w]`` of the pixels that a step draws; 0 on held-out patches in the first steps."""
+        """Return the weights ``[h,w]`` of the pixels that a step draws.
+
+        In the first steps the weights are 0 on held-out patches.
+        """
         weight = self.step_weights[step.mode.size][step.view][step.sample.pixels]
         if step.mode.stride == 1 or self.first_pixels is None:
             return np.ascontiguousarray(weight)
         return np.where(self.first_pixels[step.view][step.sample.pixels], weight, np.float32(0))
 
     def outside_view(self, step: int, progress: float) -> int | None:
-        """Return the index of the view from outside that is drawn after step ``step`` (from 1); None for no view."""
+        """Return the index of the view from outside to draw after step ``step`` (from 1), or None to draw none."""
         outside, rates = self.job.outside, self.job.options.tuning
         if outside is None or progress < rates.outside_from or step % rates.outside_every:
             return None
@@ -209,7 +212,7 @@ class Step:
     """What one step of a fit draws: a view, a background, a draw mode, and the Gaussians that take part."""
 
     number: int  # From 1
-    progress: float  # Share of the steps that come before this one
+    progress: float  # Share of the steps that come before this step
     mode: DrawMode
     view: int
     background: np.ndarray  # [3] float32
@@ -226,7 +229,7 @@ class Schedule:
     def __init__(self, run: FitRun):
         self.run, self.rng = run, np.random.default_rng(run.job.seed)
         self.views_left: list[int] = []  # views that the current round over all views has not drawn yet
-        # for each view, the number of its next sample in OFFSETS; views begin with different samples
+        # for each view, the index of the next sample in OFFSETS; views begin with different samples
         self.samples = list(range(len(run.job.photos[0])))
 
     def draw(self, number: int, progress: float, count: int) -> Step:
@@ -251,7 +254,10 @@ class Schedule:
 
 
 def step_sizes(rates: Tuning, progress: float, steps: int) -> np.ndarray:
-    """Return the step size of each of the fourteen parameters; it decays geometrically, and further in longer runs."""
+    """Return the step size of each of the fourteen parameters.
+
+    Step sizes decay geometrically, and further in longer runs.
+    """
     usual_steps = 300  # in a run with twice as many steps, the last step size is half as large
     decay = rates.decay * min(1.0, usual_steps / steps)
     start_rates = [rates.means_lr, rates.scales_lr, rates.quats_lr, rates.opacities_lr, rates.colors_lr]
@@ -262,8 +268,8 @@ def step_sizes(rates: Tuning, progress: float, steps: int) -> np.ndarray:
 def first_decay(rates: Tuning, rounds: float) -> float:
     """Return the decay of Adam's first moment after a number of ``rounds`` over all views.
 
-    The moment averages about two steps at first, and one step more after every four rounds, up to ``rates.beta1``.
-    Early gradients change quickly, so few gradients are averaged. Later gradients differ most between views, so more
-    gradients are averaged.
+    The moment averages about two steps at first, and about one more step after every four rounds, up to
+    ``rates.beta1``. Early gradients change quickly, so the average is over few gradients. Later gradients differ mostly
+    from view to view, so the average is over more gradients.
     """
     return min(rates.beta1, 1 - 1 / (2 + rounds / 4))

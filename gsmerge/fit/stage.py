@@ -22,8 +22,8 @@ from gsmerge.runtime.record import record_choices, stage
 from gsmerge.settings.fit import FitOptions
 from gsmerge.types import Decoded, Gaussians, PicturedScene
 
-CLOSE = 1.0  # if held-out patches gain less than this, in dB, whole photos decide whether a fit is accepted
-START = 0.57  # a run that grows starts with this share of its final number of Gaussians
+CLOSE = 1.0  # if held-out patches gain less than CLOSE dB, whole photos decide whether a fit is accepted
+START = 0.57  # a run that grows starts with the share START of its final number of Gaussians
 
 
 def fit_scene(
@@ -36,7 +36,7 @@ def fit_scene(
     num_scored: int | None = None,
     held_out: Sequence[int] = (),
 ) -> Fitted:
-    """Fit decoded Gaussians to the pictures of ``views`` of a canonical scene (None: all views).
+    """Fit decoded Gaussians to the pictures of some ``views`` of a canonical scene, or of all views if None.
 
     If the option ``fit`` is "none", the Gaussians are returned unchanged. If the scene has photos, ``num_scored`` is
     None, and the result is scored on all photos. If renders stand for photos, the result is scored on the views
@@ -101,11 +101,12 @@ def _choose_fit(gaussians: Gaussians, job: FitJob) -> FitResult:
 
 
 def _better_of(photos: Photos, before: Gaussians, after: Gaussians, report: FitReport) -> FitResult:
-    """Return the Gaussians ``after`` the fit, or those ``before`` it if most photos became worse.
+    """Return the Gaussians ``after`` the fit, or the Gaussians ``before`` the fit if most photos became worse.
 
-    Gaussians that were fitted before can become worse, because steps of the default size scatter them. Whole photos are
-    compared only if held-out patches gained less than ``CLOSE`` dB. A fit is not refused because of held-out patches
-    alone. Where few views see a place, the patches become worse even in fits that improve new views by up to 10 dB.
+    If the Gaussians were already fitted, they can become worse, because steps of the default size scatter them. Whole
+    photos are compared only if held-out patches gained less than ``CLOSE`` dB. A fit is not refused because of held-out
+    patches alone. If few views see a place, held-out patches become worse even in fits that improve new views by up to
+    10 dB.
     """
     if report.holdout_after - report.holdout_before >= CLOSE:
         return after, report

@@ -20,8 +20,8 @@ from gsmerge.raster.gradient import viewmat_gradient
 from gsmerge.raster.tiled_view import cache_line_rows, hides_most
 from gsmerge.runtime.threads import parallel_map
 
-# The native library reads a table of arrays by name. OF_STATE are the names of a state's arrays, and OF_SPLATS those of
-# the arrays of its splats
+# The native library reads a table of arrays by name. OF_STATE has names of arrays of a fit's state, and OF_SPLATS has
+# names of arrays of the state's splats
 OF_STATE = ("x", "x0", "m", "v", "units", "box_shares", "min_sizes", "colors")
 OF_SPLATS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 # Arrays whose values each step sets, and the lengths of these arrays
@@ -43,7 +43,7 @@ class StepBuffers:
     tables: dict[tuple[int, int], tuple[FilledTable, list[Callable[[], None]]]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Allocate the arrays whose sizes depend on the number of Gaussians, and take over those of the state."""
+        """Allocate arrays whose sizes depend on the number of Gaussians, and use the arrays of the state."""
         n = len(self.state.x)
         widths = {"tints": 3, "sums": SUMS, "g_means": 3, "g_quats": 4, "g_scales": 3, "g_colors": 3}
         self.gaussians |= {name: np.empty((n, width), np.float32) for name, width in widths.items()}
@@ -100,7 +100,7 @@ class StepBuffers:
         self.room = {"flatten_ids": np.empty(count, np.int32), "slots": np.empty((count, SUMS), np.float32)}
 
     def _fill_table(self, photo: np.ndarray, weight: np.ndarray, drawn: np.ndarray) -> FilledTable:
-        """Return the table for photos of this size; it points to the photo, its weights and the drawn opacities."""
+        """Return the table for photos of this size, with the addresses of photo, weights and drawn opacities."""
         of_step = {"photo": photo, "weight": weight, "drawn": drawn}
         if weight.shape not in self.tables:
             table = STEP.fill(self.gaussians | self.room | self._pixel_buffers(*weight.shape) | of_step)

@@ -36,11 +36,11 @@ class Optimiser:
 
     @property
     def viewmats(self) -> np.ndarray | None:
-        """Poses ``[v,4,4]`` of the cameras, which the fit moves; None if cameras are fixed."""
+        """Poses ``[v,4,4]`` of the cameras that the fit moves, or None if cameras are fixed."""
         return None if self.poses is None else self.poses.viewmats
 
     def step(self, state: FitState, step: Step) -> float:
-        """Change a state by one Adam step on one view; return the mean squared error of the pixels that count."""
+        """Change a state by one Adam step on one view; return the weighted mean squared error of the pixels."""
         rates = self.run.job.options.tuning
         weight = self.run.weight(step)
         photo, camera = self.select_view(step)

@@ -18,8 +18,8 @@ from gsmerge.runtime.threads import in_turn
 from gsmerge.types import Cameras, Gaussians
 
 MOST_SCORED = 12  # a fit is scored on at most this many photos
-ENOUGH_PHOTOS = 6  # a survey needs no further photo of a Gaussian whose centre is inside this many
-# A photo is added to a survey if more than this share of its Gaussians is inside fewer than ENOUGH_PHOTOS photos
+ENOUGH_PHOTOS = 6  # a survey needs no more photos of a Gaussian whose centre is inside ENOUGH_PHOTOS
+# A photo is added to a survey if more than FEWER_SHARE of its Gaussians are inside fewer than ENOUGH_PHOTOS photos
 FEWER_SHARE = 0.03
 
 
@@ -46,7 +46,7 @@ class Survey:
 def survey_photos(gaussians: Gaussians, run: FitRun) -> Survey:
     """Draw Gaussians at the cameras of half-size photos, and measure what each photo shows of each Gaussian.
 
-    :func:`choose_photos` chooses the photos. The sizes of pixels are those of the largest photos of the fit.
+    :func:`choose_photos` chooses the photos. Sizes of pixels are measured in the largest photos of the fit.
     """
     photos = run.job.photos
     state, half, count = start_state(gaussians), photos[1], len(gaussians)
@@ -104,7 +104,7 @@ def spread_views(count: int) -> list[int]:
 
 
 def peak_weights(gaussians: Gaussians, photos: Photos) -> tuple[np.ndarray, np.ndarray]:
-    """Return the largest blending weight ``[n]`` of each Gaussian, and a mask ``[n]`` of those in some frustum."""
+    """Return each Gaussian's largest blending weight ``[n]``, and a mask ``[n]`` of Gaussians that a camera may see."""
     splats = make_splats(gaussians)
 
     def view_peaks(view: int) -> tuple[np.ndarray, np.ndarray]:
@@ -120,7 +120,7 @@ def peak_weights(gaussians: Gaussians, photos: Photos) -> tuple[np.ndarray, np.n
 
 
 def score_images(images: Sequence[np.ndarray], run: FitRun, half: Photos) -> float:
-    """Return the PSNR (dB) of renders of the scored photos on held-out patches; NaN if none are held out."""
+    """Return the PSNR (dB) of renders of the scored photos on held-out patches, or NaN without such patches."""
     options, views = run.job.options, choose_scored_photos(len(half))
     if not options.scored:
         return float("nan")

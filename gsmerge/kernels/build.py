@@ -64,7 +64,7 @@ class Platform:
 
     @property
     def triple(self) -> str:
-        """The target triple for the compiler. The C library in its name is not linked."""
+        """The target triple for the compiler. The C library that is part of the triple is not linked."""
         kind = "x86_64" if self.machine == "x86_64" else "aarch64"
         system = {"macosx": "macos.11.0", "win": "windows-gnu"}.get(self.system, "linux-gnu.2.17")
         return f"{kind}-{system}"

@@ -60,6 +60,6 @@ def add_light(points, normals, axes, centre, radius, maps, bias, weights, out):
         centre: ``[3]`` float64 middle of the shadow maps.
         radius: Half the side of the shadow maps.
         maps: ``[k,s,s]`` float32 distances of the first surfaces from the middle, along the rays.
-        bias: Largest distance behind that surface at which a point is still lit.
+        bias: Largest distance behind the first surface at which a point is still lit.
         out: ``[n]`` float32, to which the light is added.
     """

@@ -1,4 +1,4 @@
-"""Compare the pixels of one view with what another view shows of the same points."""
+"""Compare what two views show of the same points."""
 
 from __future__ import annotations
 
@@ -53,9 +53,10 @@ _find_surfaces = declare(
 def find_surfaces(means, rows, others, valid, viewmat, K, width, near, same):
     """Find the pixels, among the pixels ``rows`` of a view, whose surface another view shows too.
 
-    ``means`` and ``others`` are the points of all pixels of the two views. Two pixels show the same surface if the
-    other view's point is ``valid``, and the logarithms of both depths differ by less than ``same``. Returns the
-    positions in ``rows`` of the pixels whose surface the other view shows, and the pixels of the other view.
+    ``means`` are the points of all pixels of one view, and ``others`` of the other view. Two pixels show the same
+    surface if the other view's point is ``valid``, and the logarithms of both depths differ by less than ``same``.
+    Returns the positions in ``rows`` of the pixels whose surface the other view shows, and the pixels of the other
+    view.
     """
     ids, pixels = np.empty((2, len(rows)), np.int64)
     count = _find_surfaces(means, rows, others, valid.view(np.uint8), viewmat, K, width, near, same, ids, pixels)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from gsmerge.kernels.signature import STATUS, f4, f8, i4, i8, native, u4
 
-LOOKS = 10  # number of columns before those of the harmonics
+LOOKS = 10  # number of columns before the columns of the harmonics
 
 
 @native(

@@ -55,7 +55,7 @@ def convolve(picture: Picture, across: np.ndarray, down: np.ndarray) -> Picture:
 def blur(picture: Picture, sigma: float, size: int | None = None) -> Picture:
     """Return a picture ``[h,w]`` or ``[h,w,c]`` as float32, blurred by a Gaussian of ``sigma`` pixels.
 
-    The filter has an odd number ``size`` of pixels, by default all those within four ``sigma``.
+    The filter has an odd number ``size`` of pixels, by default all pixels within four ``sigma``.
     """
     taps = _gaussian_taps(sigma, round(8 * sigma + 1) | 1 if size is None else size)
     return convolve(picture, taps, taps)

@@ -31,7 +31,7 @@ _see_points = declare(
 
 
 def see_points(points, viewmats, Ks, depths, width, height, near, behind):
-    """Return a mask ``[v,n]`` of ``points [n,3]`` inside the picture of each camera, and one of those that it sees.
+    """Return a mask ``[v,n]`` of ``points [n,3]`` inside each camera's picture, and a mask ``[v,n]`` of points seen.
 
     A point is inside only if its depth is more than ``near``. A point inside is seen if its depth is at most ``behind``
     times the depth of the surface at its projection. ``depths [v,lines,columns]`` are the depths of surfaces in a grid
@@ -65,7 +65,7 @@ def follow_pixels(points, viewmats, Ks, ids, tails, ends, before, keys, views, w
 def linearise(points, pixels, K, pose, jacobian, residuals):
     """Write the reprojection errors of a view's points, and their derivatives with respect to camera parameters.
 
-    ``residuals [2n]`` are the errors of all points to the right, then those downwards, in pixels. The columns of
+    ``residuals [2n]`` are the errors of all points to the right, then the errors downwards, in pixels. The columns of
     ``jacobian [2n,6+f]`` are derivatives with respect to the camera's rotation, its shift, and f intrinsics: the
     logarithm of the focal length (f = 1), or of both focal lengths (f = 2), and also the principal point (f = 4).
     """

@@ -29,7 +29,7 @@ _CODES = {
     "i8": ("int64_t", ctypes.c_int64), "f4": ("float", ctypes.c_float), "f8": ("double", ctypes.c_double),
 }  # fmt: skip
 _POSITIONAL = inspect.Parameter.POSITIONAL_OR_KEYWORD
-ArraySize = int | str  # a number, or the name of a size, which may be that of an integer argument
+ArraySize = int | str  # a number, or the name of a size or of an integer argument
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class Argument:
 
     @cached_property
     def span(self) -> tuple[int, int]:
-        """The smallest and the largest integer within the type and within those limits that are numbers."""
+        """The smallest and the largest integer that the type and the numeric limits allow."""
         limits = np.iinfo(self.dtype)
         most = self.below - 1 if isinstance(self.below, int) else self.most
         return (

@@ -45,8 +45,7 @@ from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians
 from gsmerge.values.arrays import Array, as_array, concat_columns, concat_rows, like
 
-# Fields that a merged Feature Gaussian can take from one of its parts. All other fields describe the whole cluster of
-# parts
+# Fields that a merged Feature Gaussian can take from one of its parts. All other fields describe all parts together
 OWN_COLUMNS = (*CORRECTED, "gains", "shN", "footprints")
 RunTable = Callable[[np.ndarray, int], Array]  # takes the groups and the width of a table, and returns [groups,columns]
 
@@ -145,7 +144,7 @@ class NetworkContext(Corrector):
 
     @property
     def makes_children(self) -> bool:
-        """True if the heads make all children themselves, instead of correcting those of the closed formulas."""
+        """True if the heads make all children, instead of correcting children made by closed formulas."""
         return self.options.makes_children
 
     def decode(self, children: Gaussians, parents: np.ndarray, features: FeatureGaussians) -> Gaussians:
@@ -242,7 +241,7 @@ def decode_gaussians(
 
     The children of a Feature Gaussian are adjacent. ``parents [n]`` are the rows of the Feature Gaussians in
     ``group_features``, ascending. Groups of three children use the head for four children. Five to eight children are
-    corrected in two halves, as if each half were a group of its own. Heads with absolute outputs cannot correct halves.
+    corrected in two halves, as if each half were a group. Heads with absolute outputs cannot correct halves.
     """
     children = prepare_children(children, parents, group_features, context.options)
     residuals = as_array(run_heads(contiguous(children), parents, group_features, context))

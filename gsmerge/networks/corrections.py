@@ -22,7 +22,7 @@ from gsmerge.values.arrays import Array, like
 # Columns of a correction
 MEAN_COLUMNS, SIZE_COLUMNS, ROTATION_COLUMNS = slice(0, 3), slice(3, 6), slice(6, 9)
 LOGIT_COLUMN, COLOR_COLUMNS, MASS_COLUMN = 9, slice(10, 13), 13  # the last is only in corrections of Feature Gaussians
-HALF = 0.5  # encoder, merger and refiner may each use this share of the bounds
+HALF = 0.5  # encoder, merger and refiner may each use the share HALF of the bounds
 CORRECTION_ROWS = 8192  # rows per task
 
 

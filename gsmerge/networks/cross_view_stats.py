@@ -29,12 +29,12 @@ def cross_view_stats(
     """Measure how well points agree with the Gaussians that they project onto in every other view.
 
     The points ``means [g,3]`` have base colours ``sh0 [g,1,3]`` and belong to ``views [g]`` int64. A point is compared
-    with the ``most`` views nearest to its own view, by default with all others.
+    with the ``most`` views nearest to the view of the point, by default with all other views.
 
     Returns statistics ``[g,7]`` float32, scaled to about 1. Column 0 is the logarithm of the number of views that see
-    the point. Columns 1 to 3 are the shares, among the views that see the point, of those that have a surface at the
-    point, behind it, and in front of it. Columns 4 and 5 are the mean differences of colours and of relative depths,
-    and column 6 is the logarithm of the number of all views.
+    the point. Of the views that see the point, columns 1 to 3 are the shares with a surface at the point, behind the
+    point, and in front of it. Columns 4 and 5 are the mean differences of colours and of relative depths, and column 6
+    is the logarithm of the number of all views.
     """
     stats = np.zeros((len(means), NUM_STATS), np.float32)
     stats[:, -1] = math.log(len(cameras)) / 4
@@ -65,10 +65,11 @@ def cross_view_stats(
 def nearest_of_other_views(means: np.ndarray, views: np.ndarray, count: int) -> np.ndarray:
     """Return, for each point, the nearest points of other views ``[g,count]`` int64, the nearest first.
 
-    The finite points ``means [g,3]`` float64 belong to ``views [g]``. A view below 0 differs from all others. Rows with
-    fewer than ``count`` points end with -1. The search for a point ends after ``MAX_COMPARED`` times ``count``
-    comparisons, at least 1,024. The search is limited because most compared points are of the point's own view, and
-    Gaussians farther away do not overlap. The paper matches neighbours of other views in section 4.4.
+    The finite points ``means [g,3]`` float64 belong to ``views [g]``. If a number in ``views`` is negative, the point
+    belongs to no view, and all other points count as points of other views. Rows with fewer than ``count`` points end
+    with -1. The search for a point ends after ``MAX_COMPARED`` times ``count`` comparisons, at least 1,024. The search
+    is limited because most compared points are of the point's own view, and Gaussians farther away do not overlap. The
+    paper matches neighbours of other views in section 4.4.
     """
     num = len(means)
     neighbors, means = np.empty((num, count), np.int64), np.ascontiguousarray(means)

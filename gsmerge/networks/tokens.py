@@ -45,7 +45,7 @@ def describe_features(
 ) -> GroupFeatures:
     """Return the inputs of the networks for Feature Gaussians whose statistics are known.
 
-    ``stats [g,7]`` are those of :func:`cross_view_stats`. ``views [g]`` define the frames of the Feature Gaussians, and
+    ``stats [g,7]`` come from :func:`cross_view_stats`. ``views [g]`` define the frames of the Feature Gaussians, and
     ``num_members [g]`` are their numbers of members.
     """
     bare = make_group_features(features, views, np.zeros((len(features), GROUP_COLUMNS), np.float32), cameras)
@@ -158,7 +158,7 @@ def sample_members(keys: np.ndarray, sizes: np.ndarray, width: int, seeds: np.nd
     uint64 choose a random member of each run, so that the sample covers the group (paper supplement, encoder compute).
 
     Returns positions ``[g,width]`` in ``keys``, and a mask ``[g,width]`` that is false where a group has too few
-    members. Where the mask is false, the position is that of the group's first member.
+    members. Where the mask is false, the position belongs to the group's first member.
     """
     offsets = np.cumsum(sizes) - sizes
     order = np.lexsort((keys, np.repeat(np.arange(len(sizes)), sizes)))
@@ -178,7 +178,7 @@ def hash_uniform(seeds: np.ndarray, salts: np.ndarray) -> np.ndarray:
 
 
 def hash_pairs(seeds: np.ndarray, salts: np.ndarray) -> np.ndarray:
-    """Hash pairs of a seed and a salt, both uint64, to uint64 (splitmix64, Steele et al. 2014)."""
+    """Hash pairs of a seed and a salt, both uint64, to uint64 (splitmix64, Steele 2014)."""
     x = seeds + (salts + np.uint64(1)) * np.uint64(0x9E3779B97F4A7C15)
     x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)

@@ -1,8 +1,8 @@
 """Run the forward pass of the networks on arrays with the native library.
 
-The arithmetic is that of the torch modules for training, :mod:`gsmerge.research.training.modules`, up to rounding.
-Every group is computed by itself, so the results for a group depend neither on the other groups of a table nor on the
-number of threads.
+Up to rounding, results equal the results of the torch modules for training, in
+:mod:`gsmerge.research.training.modules`. Every group is computed by itself, so the results for a group depend neither
+on the other groups of a table nor on the number of threads.
 """
 
 from __future__ import annotations
@@ -70,8 +70,8 @@ class NetworkWeights:
     def run(self, name: str, *inputs: np.ndarray) -> np.ndarray:
         """Run ``"encoder"``, ``"merger"``, ``"refiner"`` or ``"heads.K"`` on a table of b groups.
 
-        The inputs are those of the torch module of the same name. Returns the outputs of this network after tanh in one
-        array ``[b,columns]``, with 0 in place of NaN. The outputs of a head have ``K * 13`` columns, 13 for each child.
+        The torch module of this name takes the same inputs. Returns the outputs of this network after tanh in one array
+        ``[b,columns]``, with 0 in place of NaN. The outputs of a head have ``K * 13`` columns, 13 for each child.
         """
         if name.startswith("heads."):
             return self._run_head(name, *inputs)

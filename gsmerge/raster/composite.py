@@ -69,9 +69,9 @@ def blend_depths(tiled: TiledView, farthest: float = np.inf) -> tuple[Array, Arr
 def composite(tiled: TiledView, colors: Array | None = None, background: ArrayLike = 0.0) -> tuple[Array, Array]:
     """Blend the Gaussians of a view front to back into an image.
 
-    ``colors [n,3]`` are those of all Gaussians, and may be negative. By default the spherical harmonics are evaluated
-    for this view, and their colours are clipped at 0. ``background`` has 1 or 3 numbers. Returns the image ``[h,w,3]``
-    and the remaining transmittance ``[h,w]``, float32. Raises ValueError for other shapes.
+    ``colors [n,3]`` has the colour of every Gaussian, and may be negative. By default the spherical harmonics are
+    evaluated for this view, and their colours are clipped at 0. ``background`` has 1 or 3 numbers. Returns the image
+    ``[h,w,3]`` and the remaining transmittance ``[h,w]``, float32. Raises ValueError for other shapes.
     """
     if colors is None:
         return blend(tiled, view_colors(tiled), background_color(background))
@@ -93,7 +93,7 @@ def splat_adjoint(tiled: TiledView, image: Array) -> Array:
     slots = np.empty((len(tiled.flatten_ids), kernels.CHANNELS), np.float32)
 
     def sum_tiles(span: tuple[int, int]) -> None:
-        """Write the sums over each of a range of tiles to ``slots``."""
+        """For each tile of a range, write the sums over the tile to ``slots``."""
         kernels.weighted_sums(*tiled.lists, *span, channels, slots)
 
     with use_threads() as threads:

@@ -35,7 +35,7 @@ class Gradients:
     viewmat: Array | None  # [4,4] float64, last row 0; None if not requested
 
     def __getitem__(self, rows: Array) -> Gradients:
-        """Select the gradients of the Gaussians ``rows`` (mask or indices), and keep that of the view matrix."""
+        """Select the gradients of the Gaussians ``rows`` (mask or indices), and the gradient of the view matrix."""
         names = ("ids", "means", "quats", "scales", "opacities", "colors")
         return replace(self, **{name: np.ascontiguousarray(getattr(self, name)[rows]) for name in names})
 
@@ -85,7 +85,7 @@ def gradients_of(
     poses = np.empty((num_blocks, POSE), np.float32) if with_viewmat else None
 
     def blend_tiles(span: tuple[int, int]) -> None:
-        """Write the sums of each Gaussian over each of a range of tiles."""
+        """For each tile of a range, write the sums of each Gaussian over the tile."""
         blend_backward(*tiled.lists, colors, *span, image, transmittance, grad_image, grad_left, slots)
 
     def project(span: tuple[int, int]) -> None:

@@ -18,8 +18,8 @@ from gsmerge.types import Cameras, Gaussians, Scene
 from gsmerge.values.arguments import check_arguments
 from gsmerge.values.arrays import Array, like
 
-# Scenes of more Gaussians than this are tiled view by view, because a tiled view takes about as much memory as the
-# Gaussians
+# Scenes of more than ONE_AT_A_TIME Gaussians are tiled view by view, because a tiled view takes about as much memory as
+# the Gaussians
 ONE_AT_A_TIME = 4_000_000
 BAND_PIXELS = 1 << 22  # largest number of pixels drawn at once; larger images are drawn in bands to save memory
 

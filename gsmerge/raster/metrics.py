@@ -70,9 +70,10 @@ def psnr_words(psnr: float) -> str:
 
 
 def psnr_figure(psnr: float, choices: Mapping[str, object]) -> str:
-    """Write the PSNR (dB) of a scene's own views for a message.
+    """Write the PSNR (dB) of a scene's input views for a message.
 
-    If the ``choices`` of a report say that all views were scored, it has two digits. Otherwise it is an estimate.
+    If the ``choices`` of a report say that all views were scored, the PSNR has two decimals, otherwise it is an
+    estimate.
     """
     return f"{psnr:.2f} dB" if choices.get("scored_all") else f"about {psnr:.1f} dB"
 
@@ -84,7 +85,7 @@ def is_worse(before: float | None, after: float | None, spare: float = 0.0) -> b
 
 
 def describe_loss(name: str, before: float | None, after: float | None, pictures: str) -> str | None:
-    """Describe a loss of quality on the scene's own ``pictures``, or return None if it is at most ``MAX_LOSS``.
+    """Describe a loss of quality on the scene's ``pictures``, or return None if the loss is at most ``MAX_LOSS``.
 
     ``before`` and ``after`` are the PSNR (dB) of the pictures from the input and from the result, or None.
     """
@@ -101,12 +102,12 @@ def describe_distance(psnr: float | None) -> str | None:
 
 
 def ssim(image: Array, reference: Array, mask: Array | None = None) -> float:
-    """Return the structural similarity, at most 1, over Gaussian windows of 11 x 11 pixels (Wang et al. 2004).
+    """Return the structural similarity, at most 1, over Gaussian windows of 11 x 11 pixels (Wang 2004).
 
     The result is the mean over channels and over the windows that lie wholly inside the image, as computed by
     scikit-image's ``structural_similarity(gaussian_weights=True, sigma=1.5, use_sample_covariance=False,
-    channel_axis=-1, data_range=1)``. This function is for measuring only. The loss of the full fit and of training has
-    its own definition, :func:`gsmerge.fit.loss.loss_ssim`.
+    channel_axis=-1, data_range=1)``. The function ``ssim`` is for measuring only. The loss of the full fit and of
+    training has its own definition, :func:`gsmerge.fit.loss.loss_ssim`.
 
     Images are ``[h,w,c]`` with at most 4 channels. ``mask [h,w]`` selects windows by their centres, but a window also
     contains the pixels around its centre. Raises ValueError if shapes differ, the image is too small or no window is

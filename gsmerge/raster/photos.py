@@ -23,8 +23,8 @@ Score = TypeVar("Score")
 
 LEAST_OPACITY = 1 / 255  # rasterizers draw no smaller opacity
 NEAR_PLANE = 0.01  # near plane of every render that is scored, in canonical units
-# Scenes of more Gaussians than this are rendered view by view, because a tiled view takes about as much memory as the
-# Gaussians. When scenes are rendered view by view, all threads share one view
+# Scenes of more than ERRORS_ONE_AT_A_TIME Gaussians are rendered view by view, because a tiled view takes about as much
+# memory as the Gaussians. When scenes are rendered view by view, all threads share one view
 ERRORS_ONE_AT_A_TIME = 400_000
 # Scored tiles are shifted by TILE_STEP columns, a prime, from one line of tiles to the next. At least LEAST_TILES of a
 # view are scored, so small views are scored whole. With 48 tiles, a PSNR gain on six views of 256 x 480 pixels seemed
@@ -58,8 +58,8 @@ class PhotoScore:
 class Sample:
     """Every ``stride``-th column and row of a photo, from ``column`` and ``row`` on.
 
-    These pixels form a smaller photo. The camera of the smaller photo projects to the centres of the sampled pixels,
-    with the low-pass of the whole photo.
+    The sampled pixels form a smaller photo. The camera of the smaller photo projects to the centres of the sampled
+    pixels, with the low-pass of the whole photo.
     """
 
     stride: int = 1
@@ -82,8 +82,8 @@ class Photos:
     images: np.ndarray  # [v,h,w,3] float32 sRGB in [0, 1], or uint8 if photos are larger than the grid; see image()
     viewmats: np.ndarray  # [v,4,4] world to camera
     Ks: np.ndarray  # [v,3,3] intrinsics at this size
-    # Variance of the low-pass, in square pixels of these photos. The low-pass is scaled from that of full-size photos,
-    # so that a fit filters Gaussians as the final render does
+    # Variance of the low-pass, in square pixels of these photos. The low-pass is scaled from the low-pass of full-size
+    # photos, so that a fit filters Gaussians as the final render does
     eps2d: float
     weights: np.ndarray | None = None  # [v,h,w] float32, weight of each pixel in [0, 1], by default 1
     empty: np.ndarray | None = None  # [v,h,w] float32 share of each pixel that shows the background, by default 0
@@ -292,7 +292,7 @@ def _average_scores(scores: Sequence[RenderScore]) -> PhotoScore:
 
 
 def _score_render(image: np.ndarray, covered: np.ndarray, photos: Photos, view: int, every: int) -> RenderScore:
-    """Score a render ``[h,w,3]`` against a view's photo, over all scored pixels and over those in ``covered [h,w]``.
+    """Score a render ``[h,w,3]`` against a view's photo, over all scored pixels and over ``covered [h,w]`` pixels.
 
     The render is clipped in place. ``every`` is as in :func:`score_photos`.
     """

@@ -26,7 +26,7 @@ THREAD_PIECE = 1 << 13  # least number of Gaussians or intersections per thread
 CROWDED, CROWDED_EACH = 1 << 24, 16
 EPS2D = 0.3  # low-pass of the rasterizer, which widens Gaussians; square pixels of the full-size image
 WORLD_NEAR_PLANE, FAR_PLANE = 0.01, math.inf  # depths, world units
-# Directions are clamped at this share of the image's size outside its borders, as in gsplat, because the first-order
+# Directions are clamped at SPARE_SHARE of the image's size outside its borders, as in gsplat, because the first-order
 # projection is too inexact farther outside
 SPARE_SHARE = 0.15
 
@@ -270,7 +270,7 @@ def _check_view(viewmat: Array, K: Array, width: int, height: int) -> None:
 def _convert_for_kernels(splats: Splats, opacities: Array | None, keep: Array | None) -> tuple[Array, Array | None]:
     """Convert opacities ``[n]`` and the mask ``keep [n]`` to the types of the kernels.
 
-    By default, the opacities are those of the splats. Raises ValueError if the lengths differ from that of the splats.
+    By default, the splats give the opacities. Raises ValueError if a length is not the number of splats.
     """
     opacities = splats.opacities if opacities is None else np.ascontiguousarray(opacities, np.float32)
     keep = None if keep is None else np.ascontiguousarray(keep, bool).view(np.uint8)

@@ -21,10 +21,10 @@ from gsmerge.types import Groups, Scene
 def assign(scene: Scene, groups: Groups, *, by_contribution: bool = False) -> Members:
     """Return all Gaussians of a canonical scene as members of superpixels, each with its pixel.
 
-    A Gaussian belongs to the superpixel of its pixel. If views have no Gaussians of their own, ``by_contribution``
-    assigns each Gaussian to the superpixel, of any view, in which the sum of its blending weights is largest (paper,
-    supplement "Compaction of Non-Pixel-Aligned FF Backbones"). Every view is drawn to measure the sums of blending
-    weights. Raises UsageError if no view sees any Gaussian.
+    A Gaussian belongs to the superpixel of its pixel. If Gaussians belong to no pixels, ``by_contribution`` assigns
+    each Gaussian to the superpixel, of any view, in which the sum of its blending weights is largest (paper, supplement
+    "Compaction of Non-Pixel-Aligned FF Backbones"). Every view is drawn to measure the sums of blending weights. Raises
+    UsageError if no view sees any Gaussian.
     """
     members = scene_members(scene)
     if by_contribution and not scene.has_own_pixels:
@@ -55,7 +55,7 @@ def find_owners(scene: Scene, groups: Groups) -> Owners:
     best = Owners(np.zeros(count, np.float32), np.full(count, -1, np.int32), np.full(count, -1, np.int32))
 
     def update_best(view: int, tiled: TiledView) -> None:
-        """Replace entries of ``best`` by superpixels of this view, where these have larger contributions."""
+        """Replace entries of ``best`` by superpixels of this view with larger contributions."""
         values, labels = view_owners(tiled, groups.labels[view], groups.counts[view])
         with lock:
             best_values, best_views = best.values[tiled.ids], best.views[tiled.ids]

@@ -16,10 +16,11 @@ from gsmerge.stages.sky import sky
 from gsmerge.types import Cameras, Gaussians
 
 BOX_QUANTILES = (1, 99)  # the scene's box reaches from the first to the second percentile of positions on each axis
-FLOATER_NEIGHBORS = 8  # an isolated Gaussian touches none of this many nearest Gaussians
+FLOATER_NEIGHBORS = 8  # an isolated Gaussian touches none of its FLOATER_NEIGHBORS nearest Gaussians
 # A fit may leave Gaussians that hang across the scene like curtains. The second largest scale of such a curtain exceeds
 # the share CURTAIN[0] of half the diagonal of the scene's box, or its largest scale exceeds the share CURTAIN[1] of
-# half the diagonal. The scale that is too large also exceeds CURTAIN_FACTOR times its median over all Gaussians
+# half the diagonal. The same scale, second largest or largest, also exceeds CURTAIN_FACTOR times its median over all
+# Gaussians
 CURTAIN, CURTAIN_FACTOR = (0.1, 0.33), 8.0
 FLOATER_GAUSSIANS = 200_000  # the share of floaters is estimated from at most about this many Gaussians
 
@@ -43,9 +44,9 @@ def floaters(gaussians: Gaussians, rows: np.ndarray | None = None) -> np.ndarray
     """Return a mask ``[n]`` of finite Gaussians that are isolated, far beyond the scene, or hang across it.
 
     A Gaussian is isolated if it touches none of its eight nearest neighbours, and if the nearest of them is more than
-    three times as far away as the median. Two Gaussians touch if their distance is at most three times the sum of
-    their largest scales. :func:`beyond_scene` and :func:`curtains` find the other two kinds. If ``rows [m]`` are given,
-    only these Gaussians are tested, and the mask is ``[m]``.
+    three times as far away as the median. Two Gaussians touch if their distance is at most three times the sum of their
+    largest scales. :func:`beyond_scene` finds Gaussians far beyond the scene, and :func:`curtains` finds Gaussians that
+    hang across it. If ``rows [m]`` are given, only these Gaussians are tested, and the mask is ``[m]``.
     """
     rows = np.arange(len(gaussians)) if rows is None else rows
     means, sizes = gaussians.means.astype(np.float64), _sorted_scales(gaussians)[1].astype(np.float64)
@@ -66,7 +67,7 @@ def _nearest_distances(
     """Return the distance ``[m]`` of each of the Gaussians ``rows [m]`` from its nearest neighbour, and a mask ``[m]``.
 
     The mask is true for Gaussians that touch one of their ``count`` nearest neighbours. ``means [n,3]`` and the largest
-    scales ``sizes [n]`` are those of all Gaussians.
+    scales ``sizes [n]`` describe all Gaussians.
     """
     ids, distances = find_nearest(means, count, rows)
     touch_factor = 3.0  # Gaussians touch if their distance is at most this many times the sum of their largest scales
@@ -135,7 +136,7 @@ def clean(
 
 
 def describe_counts(counts: Counts, *, placed: bool) -> str:
-    """Describe how many Gaussians were dropped for each reason: those of :func:`clean`, and ``surplus``.
+    """Describe how many Gaussians were dropped for each reason, which is ``surplus`` or a reason of :func:`clean`.
 
     ``placed`` is true if cameras were placed, because the scene has none.
     """
@@ -151,6 +152,6 @@ def describe_counts(counts: Counts, *, placed: bool) -> str:
 
 
 def faintest_dropped(gaussians: Gaussians, count: int) -> Gaussians:
-    """Return, in their order, the ``count`` Gaussians with the largest products of opacity and two largest scales."""
+    """Return, in their order, the ``count`` Gaussians whose opacity times their two largest scales is largest."""
     area = np.sort(gaussians.scales, axis=1)[:, 1:].prod(1)
     return gaussians[np.sort(np.argsort(-gaussians.opacities * area, kind="stable")[:count])]

@@ -32,11 +32,11 @@ def decode(
     """Decode each Feature Gaussian into K Gaussians, which are its children.
 
     The members are halved repeatedly across their widest direction in colour and position, and each part becomes a
-    child. Because of this halving, the children for K = 2 are unions of the children for K = 4. Members with the same
-    position and colour cannot be halved, so their group has fewer children. Networks with absolute outputs do not
-    halve, but make exactly K children of every group. ``counts [g]`` has a K of at least 1 for each group. Without
-    ``counts``, K is ``options.max_k``. The children of a group are adjacent. Children that are fainter than
-    ``options.min_opacity`` are left out.
+    child. So the two children for K = 2 are unions of the four children for K = 4. Members with the same position and
+    colour cannot be halved, so their group has fewer children. Networks with absolute outputs do not halve, but make
+    exactly K children of every group. ``counts [g]`` has a K of at least 1 for each group. Without ``counts``, K is
+    ``options.max_k``. The children of a group are adjacent. Children that are fainter than ``options.min_opacity`` are
+    left out.
     """
     if counts is None:
         counts = np.full(len(features), options.max_k)
@@ -157,9 +157,9 @@ def merged_count(merged: MergedViews, options: DecodeOptions, *, grows: bool) ->
     """Return the number of Gaussians to decode merged views into, or None for K of each Feature Gaussian.
 
     If an exact number was requested and no fit grows to it, this number is returned. In all other cases the number is K
-    for each group and for each superpixel without members, whose Gaussians other groups get. A superpixel has no
-    members if its Gaussians belong to a nearer view. Heads that make exactly K Gaussians of every group cannot give one
-    group more.
+    for each group, and K for each superpixel without members. A superpixel has no members if its Gaussians belong to a
+    nearer view, and other groups get the K Gaussians of this superpixel. Heads that make exactly K Gaussians of every
+    group cannot make more for other groups.
     """
     segmentation, num_empty = merged.segmentation, len(merged.segmentation.groups) - merged.num_groups
     if segmentation.exact and not grows:

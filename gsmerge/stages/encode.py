@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from gsmerge.networks.weights import RunnableNetworks
 
 # A group is contradicted if more views see through it than have a surface at its position. The optical depth of a
-# contradicted group is multiplied by ALONE if no other view has a surface at its position, and by DISPUTED if one has
+# contradicted group is multiplied by ALONE if no other view has a surface at its position, and otherwise by DISPUTED
 ALONE, DISPUTED = 0.15, 0.39
 
 

@@ -29,7 +29,7 @@ from gsmerge.types import Cameras, Gaussians
 
 # Chosen on seven training captures
 FILLED_SHARE = 0.03  # largest number of new Gaussians, as a share of the fitted ones
-FILL_LEVEL = 8  # width of a drawing's pixel, in pixels of the views; it is large, since what fills gaps is blurred
+FILL_LEVEL = 8  # width of a drawing's pixel, in pixels of the views; large, because new Gaussians are blurred
 FILL_MARGIN = 0.05  # margin that is added to each side of a drawing, as a share of its width or height
 # Gaps have a transmittance above the first number, and surfaces have a transmittance below the second one
 GAP_TRANSMITTANCE, SURFACE_TRANSMITTANCE = 0.1, 0.05
@@ -38,7 +38,7 @@ GAP_TRANSMITTANCE, SURFACE_TRANSMITTANCE = 0.1, 0.05
 WINDOW_SHARE, NEARER_SHARE = 0.08, 0.85
 MOST_FILLED_VIEWS = 64  # most views of a scene that is filled, because the time grows with their square
 DEPTH_FACTORS = (1, 1.06, 1.15, 1.3, 1.6, 2.2)  # depths that are tried for a new Gaussian, in depths of the surface
-BESIDE_PIXELS = 2  # a new Gaussian reaches at most this many pixels beyond its own pixel
+BESIDE_PIXELS = 2  # a new Gaussian reaches at most BESIDE_PIXELS beyond the pixel that it fills
 FRONT_SHARE = 0.98  # a Gaussian hides a surface if its depth is less than this share of the surface's depth
 
 
@@ -46,7 +46,7 @@ FRONT_SHARE = 0.98  # a Gaussian hides a surface if its depth is less than this 
 def fill_between(
     fitted: Gaussians, cameras: Cameras, outside: Outside | None, most: int, *, beyond: bool = False
 ) -> Gaussians:
-    """Make Gaussians that fill gaps seen from cameras between or just beside those of the photos.
+    """Make Gaussians that fill gaps seen from cameras between or just beside the cameras of the photos.
 
     There are at most ``most`` new Gaussians, and at most ``FILLED_SHARE`` times the number of ``fitted`` ones. Gaps
     that cameras half-way between two views show are filled first. The new Gaussians are at positions where neither a
@@ -80,7 +80,7 @@ def fill_between(
 
 
 def _on_covered_pixels(gaussians: Gaussians, covering: Gaussians, camera: Cameras) -> np.ndarray:
-    """Return a mask ``[n]`` of the Gaussians whose centres are on pixels of ``camera`` that ``covering`` cover.
+    """Return a mask ``[n]`` of the Gaussians with centres on covered pixels of ``camera``.
 
     Each of the Gaussians ``covering`` covers the four pixels nearest to its centre.
     """

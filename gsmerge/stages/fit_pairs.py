@@ -23,9 +23,9 @@ RENDERS_STEP = 0.09
 
 
 def choose_power(count: int, prepared: Prepared, options: FitOptions, seed: int) -> float:
-    """Return the one of ``POWERS`` with which merged Gaussians show the views best after a short fit.
+    """Choose one of the ``POWERS``, so that merged Gaussians show the views best after a short fit.
 
-    Costs of merging are multiplied by masses to this power.
+    The costs of merging Gaussians are multiplied by the masses to the chosen power.
     """
     photos = scene_photos(prepared.scene)
     tuning = replace(options.tuning, outside_from=1.0)  # no steps for views from outside, which are not scored
@@ -49,7 +49,7 @@ def merge_scene(count: int, power: float, prepared: Prepared) -> Decoded:
 
 
 def fit_around(start: Decoded, prepared: Prepared, options: FitOptions, seed: int) -> Fitted:
-    """Fit Gaussians to renders of the scene from its own views and, in a long fit, from cameras around these.
+    """Fit Gaussians to renders of the scene from its views and, in a long fit, from cameras around the views.
 
     If the scene has no cameras, some are placed, and the placed views that score the fit are left out of it. If the fit
     makes most views worse, its start is returned.

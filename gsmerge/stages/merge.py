@@ -41,9 +41,9 @@ def merge(features: FeatureGaussians, matches: Matches, networks: Corrector = AN
 
 
 def cluster_runs(matches: Matches) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Split the rows into those that are alone in their cluster, and the others, in the order of their clusters.
+    """Find the rows that are alone in their cluster, and all other rows in the order of their clusters.
 
-    Returns the rows of both kinds, and the positions of the first row of each cluster in the second kind.
+    Returns the rows that are alone, the other rows, and the position among the other rows where each cluster begins.
     """
     clusters = matches.clusters
     alone = np.bincount(clusters, minlength=matches.count)[clusters] == 1

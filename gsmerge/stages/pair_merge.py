@@ -30,7 +30,7 @@ FLATNESS = 0.01  # least scale as a share of the largest scale, so that the loga
 MIN_OPACITY = 1e-4  # least opacity of Gaussians that are merged, so that masses stay positive
 MOST_WIDENING = 0.05  # scales grow by at most this share for each doubling of the merged number, to close gaps
 CELLS_PER_TASK = 256  # cells that a thread merges at a time
-NEXT_AXIS = [1, 2, 0]  # products of each axis with its next axis are those of the three pairs of axes
+NEXT_AXIS = [1, 2, 0]  # each axis and its next axis give all three pairs of axes
 
 
 @dataclass(eq=False)
@@ -111,7 +111,7 @@ def _merge_round(cloud: Cloud, count: int) -> Cloud:
 def merge_rows(cloud: Cloud, pairs: np.ndarray) -> Cloud:
     """Merge pairs of rows ``[m,2]`` int32, one after another, into the first row of each pair.
 
-    Changes ``cloud``, and returns it without the second rows.
+    Changes ``cloud``, and returns it without the second row of each pair.
     """
     merge_pairs(pairs, cloud.means, cloud.covars, cloud.masses, cloud.weights, cloud.sh, cloud.sizes)
     remains = np.ones(len(cloud), bool)
@@ -134,7 +134,7 @@ def _divide_into_cells(means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _cheapest(costs: np.ndarray, count: int) -> np.ndarray:
     """Return the indices, ascending, of the ``count`` lowest finite ``costs [n]``.
 
-    If there are more equal costs than wanted, those with the lowest indices are returned.
+    Of equal costs, the lowest indices come first.
     """
     finite = np.isfinite(costs)
     count = min(count, int(finite.sum()))
@@ -146,7 +146,7 @@ def _cheapest(costs: np.ndarray, count: int) -> np.ndarray:
 
 
 def gaussians_of_cloud(cloud: Cloud, source: Gaussians, wider: float = 0.0) -> Gaussians:
-    """Convert moments to Gaussians, but copy those that were not merged from ``source``, the input of the merging.
+    """Convert moments to Gaussians, but copy unmerged Gaussians from ``source``, the input of the merging.
 
     If a mass would need an opacity above one, scales grow instead. The scales grow at most by the share ``wider`` for
     each doubling of the number of input Gaussians that a Gaussian was merged from.

@@ -30,9 +30,10 @@ COMPARED_LEVELS = 2, 4
 def split_unseen(gaussians: Gaussians, cameras: Cameras) -> tuple[Gaussians, Gaussians]:
     """Return the Gaussians that ``cameras`` see, and the Gaussians that no camera sees.
 
-    A Gaussian is unseen if its largest blending weight is below a limit. The limit is as large as possible, while
-    without the unseen Gaussians no picture changes by more than ``ROUNDING`` (root mean square). Unseen Gaussians are
-    returned in the order of their weights, the largest first. Gaussians outside of all pictures count as seen.
+    A Gaussian is unseen if its largest blending weight is below a limit. The limit is the largest one found with which
+    no picture changes by more than ``ROUNDING`` (root mean square) if the unseen Gaussians are left out. Unseen
+    Gaussians are returned in the order of their weights, the largest first. Gaussians outside of all pictures count as
+    seen.
     """
     peaks, inside = peak_weights(gaussians, blank_photos(cameras, COMPARED_LEVELS[0]))
     peaks[~inside] = np.inf
@@ -47,7 +48,7 @@ def _find_limit(gaussians: Gaussians, peaks: np.ndarray, photos: Photos) -> floa
     """Try some limits, and return the largest one that is not noticed, or 0 if all are noticed.
 
     A limit is noticed if a picture changes by more than ``ROUNDING`` without the Gaussians whose largest blending
-    weight, in ``peaks [n]``, is below this limit.
+    weight, in ``peaks [n]``, is below the limit.
     """
     start_limit = 0.02  # limit of the first trial
     # Limits up to `low` are not noticed, and limits from `high` on are noticed

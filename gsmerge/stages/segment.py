@@ -36,8 +36,8 @@ DEPTH_WEIGHT = 1.0  # weight of squared relative depth errors, relative to squar
 # Largest side of a region, as a share of the image's longer side. Gaussians of larger regions would show the error of
 # the rasterizer's affine approximation. Regions are larger only if the budget is too small
 MAX_EXTENT = 1 / 8
-# Least slope of the curve of quality at which more Gaussians are worth while, in dB of predicted quality per relative
-# increase of the number of Gaussians
+# At the knee, the predicted quality still rises by REGION_KNEE_SLOPE dB per relative increase of the number of
+# Gaussians
 REGION_KNEE_SLOPE = 1.0
 KNEE_FLOOR = 3e-4  # squared error per pixel and channel that no number of Gaussians removes, such as noise
 
@@ -49,12 +49,12 @@ class SuperpixelChoices:
     options: SegmentOptions  # Method, and number of superpixels
     limits: CountLimits  # Limits of the number of Gaussians
     start_share: float  # Share of the Gaussians with which the fit starts, before it adds the rest
-    shared: SharedTree | None  # Region tree for all counts that a run tries, or None if each count builds its own
+    shared: SharedTree | None  # Region tree for all counts that a run tries, or None if each count builds a tree
 
 
 @dataclass(eq=False)
 class SharedTree:
-    """Holder of the region tree from which all counts that a run tries are cut."""
+    """A region tree, which a run cuts for each count that it tries."""
 
     tree: RegionTree | None = None
 
@@ -115,7 +115,7 @@ class RegionTree:
 
     groups: Groups  # The superpixels before all merges, which are the leaves of the tree
     parents: tuple[np.ndarray, ...]  # For each view [2·leaves-1] int32, the parent of each region, or -1
-    order: np.ndarray  # [m] int64 numbers of all merges, the cheapest first; those of view v start at `offsets[v]`
+    order: np.ndarray  # [m] int64 numbers of all merges, the cheapest first; merges of view v start at `offsets[v]`
     offsets: np.ndarray  # [v+1] int64, number of merges in all views before each
     distortions: np.ndarray  # [m+1] float64 mean squared error after 0 to m merges
     min_regions: int  # Least number of regions of which none is larger than `MAX_EXTENT`
@@ -194,7 +194,7 @@ def _usable_depths(depths: np.ndarray, valid: np.ndarray) -> np.ndarray:
     usable = valid & np.isfinite(depths)
     positive = usable & (depths > 0)
     median = float(np.median(depths[positive])) if positive.any() else 1.0
-    depth_range = 1e3  # depths are clipped to at most this factor above or below the median
+    depth_range = 1e3  # largest factor by which a depth may be above or below the median
     clipped = np.clip(depths / median, 1 / depth_range, depth_range)
     return np.ascontiguousarray(np.where(usable, clipped, 0), np.float32)
 
@@ -203,7 +203,7 @@ def cut_tree(tree: RegionTree, budget: int) -> Groups:
     """Cut the tree into exactly ``budget`` regions in all views together, at least one in each view.
 
     If ``budget`` is above the number of superpixels, all superpixels are returned. The regions of a smaller budget are
-    unions of those of a larger budget. Raises ValueError if ``budget`` is below the number of views.
+    unions of the regions of a larger budget. Raises ValueError if ``budget`` is below the number of views.
     """
     num_views = len(tree.parents)
     if budget < num_views:

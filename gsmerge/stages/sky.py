@@ -1,9 +1,9 @@
 """Find the Gaussians of the sky in photos, without a network or a download.
 
 In a photo, the sky is a smooth region that begins at the upper border and is nowhere warmer than grey. The sky also
-becomes paler towards the horizon. A cloudy sky may not become paler, so a region also counts if it is several times as
+becomes paler towards the horizon. A cloudy sky may not become paler, so a region is also sky if it is several times as
 far away as the rest. Ceilings and white walls may be smooth, grey and at the upper border as well. But ceilings and
-walls seldom become paler or are far away, and never in several views.
+walls seldom become paler, are seldom far away, and never do either in several views.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from gsmerge.raster.photos import NEAR_PLANE
 from gsmerge.raster.weights import apply_transposed, view_weights
 from gsmerge.types import Cameras, Gaussians
 
-GRADIENT_PIXELS = 480.0  # gradients are those of a photo with this many pixels on its longer side
+GRADIENT_PIXELS = 480.0  # gradients are measured in a photo with GRADIENT_PIXELS on its longer side
 # Blue sky is brighter than DARK_SKY. White sky is brighter than WHITE_SKY, and has less chroma than GREY_SKY
 DARK_SKY, WHITE_SKY, GREY_SKY = 0.35, 0.75, 0.12
-FAR_RATIO = 3.0  # the sky is more than this many times as far away as the rest
+FAR_RATIO = 3.0  # the sky is more than FAR_RATIO times as far away as the rest
 # Least number of views that show sky, and their least share of all views. If fewer views show sky, it may be something
 # else that looks like sky
 LEAST_SKY_VIEWS, LEAST_SKY_SHARE = 2, 0.2
@@ -38,7 +38,7 @@ def sky(gaussians: Gaussians, cameras: Cameras, photos: np.ndarray) -> np.ndarra
         return mask
     # There are at most max_rounds. A round that adds less than last_share of the sky so far is the last one
     max_rounds, last_share = 6, 0.02
-    for _ in range(max_rounds):  # each round finds Gaussians that those of earlier rounds have hidden
+    for _ in range(max_rounds):  # each round finds Gaussians that were hidden behind the sky found before
         rows = np.flatnonzero(~mask)
         is_sky = _mostly_inside(gaussians[rows], cameras, regions)
         mask[rows[is_sky]] = True

@@ -5,7 +5,7 @@ image into more rectangles than requested, where cuts lower the error most. It t
 down to the exact number, and moves pixels at borders between superpixels if this lowers the error. ``bass`` is Bayesian
 adaptive superpixel segmentation from a hexagonal grid. ``bass-st`` starts from seeds that are drawn by the Shi-Tomasi
 response instead, as in the paper. ``grid`` makes plain rectangles. Rectangles of a few pixels are as good as other
-superpixels if no fit follows, and take no time. All methods make exactly as many superpixels as requested. No
+superpixels if no fit follows, and take almost no time. All methods make exactly as many superpixels as requested. No
 superpixel is empty, each is 4-connected, and each run gives the same bits.
 """
 

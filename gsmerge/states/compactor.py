@@ -28,8 +28,9 @@ def extend_state(
 
     ``settings`` are the settings of the batch. By default the effort is "draft", with which a scene gets no fit if each
     of its Gaussians belongs to a pixel. With ``recipe="paper"`` the first batch begins a state of Feature Gaussians,
-    and later batches use its networks. Raises ValueError if a setting is unknown, out of range, or impossible for the
-    state or the scene. Raises SceneError if the scene seems to have another frame of coordinates than the state.
+    and later batches use the networks of this state. Raises ValueError if a setting is unknown, out of range, or
+    impossible for the state or the scene. Raises SceneError if the scene seems to have another frame of coordinates
+    than the state.
     """
     about = {} if state is None else dict(state.about)
     scene_before, features = (None, None) if state is None else (state.scene, state.features)
@@ -53,13 +54,14 @@ class Compactor:
     """Compact views that arrive in batches.
 
     Each batch is compacted when it is added. The state keeps the Gaussians of all batches, and cameras and pictures of
-    at most ``max_views`` views. ``compact`` makes results from this scene. With ``recipe="paper"`` the state keeps
-    Feature Gaussians instead, which are matched and merged across batches (paper section 4.5, "Online reconstruction").
-    ``decode`` then makes results with any K.
+    at most ``max_views`` views. The method ``compact`` makes results from the Gaussians and views that the state keeps.
+    With ``recipe="paper"`` the state keeps Feature Gaussians instead, which are matched and merged across batches
+    (paper section 4.5, "Online reconstruction"). The method ``decode`` makes results of these Feature Gaussians with
+    any K, which is the number of Gaussians made of each.
 
     Args:
-        **settings: Settings of the batches by name, as in ``Compactor(budget="3%", max_views=16)``. The settings are
-        those of :class:`gsmerge.CompactOptions` and of :class:`gsmerge.settings.extend.ExtendOptions`.
+        **settings: Settings of the batches by name, as in ``Compactor(budget="3%", max_views=16)``. These are the
+            settings of :class:`gsmerge.CompactOptions` and of :class:`gsmerge.settings.extend.ExtendOptions`.
 
     Raises:
         ValueError: If a setting is unknown or out of range.

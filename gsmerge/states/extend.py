@@ -26,10 +26,10 @@ from gsmerge.settings.extend import ExtendOptions
 from gsmerge.types import Cameras, Gaussians, Scene
 
 # A "world" is a frame of coordinates. The colours of the earlier Gaussians in front are compared with the new pictures
-# of them. The difference of these colours is divided by the difference from random pixels. In batches of 15 captures
-# this ratio of differences was at most .87 in the same world, and .92 to 1.08 in another world, so that the worlds
-# differ if the ratio is above the limit. A ratio so near the limit that chance may decide on which side it lies decides
-# nothing.
+# of them. The difference of these colours is divided by the difference from random pixels. The quotient of both
+# differences was measured in batches of 15 captures: at most .87 in the same world, and .92 to 1.08 in another world.
+# So the worlds differ if the quotient is above WORLD_RATIO. If the quotient is so near WORLD_RATIO that chance may
+# decide, the comparison has no result.
 WORLD_RATIO = 0.9
 SAME_WORLD, ANOTHER_WORLD, UNKNOWN_WORLD = "the same", "another", "not known"  # results of comparing two worlds
 BATCH = "batch"  # path in an error about a batch, until the caller puts in the path of its file
@@ -57,7 +57,7 @@ class BatchReport:
 
     @property
     def numbers(self) -> dict[str, Any]:
-        """The facts of the report that a state stores."""
+        """Facts of this report, by name, that are stored in a state."""
         omitted = ("seconds", "choices", "notes", "options")
         return {name: value for name, value in asdict(self).items() if name not in omitted}
 
@@ -72,7 +72,7 @@ def extend(
 ) -> tuple[Scene, BatchReport]:
     """Compact a batch of views, and add it to the results of earlier batches, which have to be in the same world.
 
-    ``before`` has the earlier results; it is None for the first batch. Camera poses and exposures of the new batch do
+    ``before`` has the earlier results, and is None for the first batch. Camera poses and exposures of the new batch do
     not change. Returns a scene with the Gaussians of all batches, and the report. Rows of the scene do not belong to
     pixels. The scene keeps views at the size of the first batch's views, each with the picture to which its batch was
     fitted. Raises ValueError if a setting is impossible for the scene, and SceneError if the scene seems to be in
@@ -89,7 +89,7 @@ def extend(
             refuse_other_world(world, extend_options)
             parts = [before.gaussians]
         result = compact_in_one_piece(prepared, method, options)
-    # A note that the result is worse than its input is for final results
+    # Only a final result gets the note that the result is worse than its input
     notes = [text for text in result.report.notes if text != result.report.worse]
     notes += [NOT_COMPARED] if before is not None and world == UNKNOWN_WORLD else []
     parts.append(result.gaussians.numpy())
@@ -121,7 +121,7 @@ def compare_worlds(before: Gaussians, views: Scene, means: np.ndarray) -> str:
 
     Returns SAME_WORLD, ANOTHER_WORLD or UNKNOWN_WORLD. In the same world the pictures show the earlier Gaussians,
     except where Gaussians of the batch, whose means are ``means [n,3]``, hide earlier ones. In another world the
-    pictures are as unlike the earlier Gaussians as random pixels are.
+    pictures differ from the earlier Gaussians as much as random pixels do.
     """
     if not len(views):
         return UNKNOWN_WORLD
@@ -158,7 +158,7 @@ def _keep_pictures(prepared: Prepared) -> Scene:
 def _join_views(before: Scene, batch: Scene) -> Scene:
     """Append the views of a batch to the views ``before``, in their size.
 
-    The names of the views are those of :func:`append_names`.
+    :func:`append_names` gives the names of the views.
     """
     if len(batch) == 0 or len(before) == 0:
         return before if len(batch) == 0 else batch

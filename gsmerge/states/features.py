@@ -130,10 +130,10 @@ def extend_features(
     state: FeatureState | None, scene: Scene, options: CompactOptions, extend_options: ExtendOptions,
     *, progress: Progress | None = None,
 ) -> tuple[FeatureState, BatchReport]:  # fmt: skip
-    """Add a batch of views to a state, or begin one (None); see :func:`gsmerge.states.extend.extend`.
+    """Add a batch of views to a state, or to a new one if ``state`` is None; see :func:`gsmerge.states.extend.extend`.
 
-    Returns the new state and the report. Raises UsageError if the settings ask for a budget, for a fit, or for networks
-    other than those of the state, or if the degrees of the harmonics of the scene and of the state differ.
+    Returns the new state and the report. Raises UsageError if the settings ask for a budget, for a fit, or for other
+    networks than the state has, or if the degrees of the harmonics of the scene and of the state differ.
     """
     _check_options(options)
     options = options.with_settings(ONE_PIECE)
@@ -197,7 +197,7 @@ def _view_names(state: FeatureState | None, prepared: Prepared) -> tuple[str, ..
 
 
 def _check_world(state: FeatureState | None, scene: Scene, options: ExtendOptions) -> str:
-    """Compare the world of a scene with that of a state, both in the canonical frame; see :func:`compare_worlds`.
+    """Compare the world of a scene with the world of a state, both in the canonical frame; see :func:`compare_worlds`.
 
     Raises SceneError if the scene is in another world, unless the options allow this.
     """
@@ -209,7 +209,10 @@ def _check_world(state: FeatureState | None, scene: Scene, options: ExtendOption
 
 
 def _own_checkpoint(state: FeatureState, options: CompactOptions) -> Checkpoint:
-    """Return the networks of a state as a checkpoint; UsageError if the options name other networks."""
+    """Return the networks of a state as a checkpoint.
+
+    Raises UsageError if the options name other networks.
+    """
     stored = state.checkpoint
     if options.checkpoint != stored:
         raise UsageError(
@@ -222,8 +225,7 @@ def _own_checkpoint(state: FeatureState, options: CompactOptions) -> Checkpoint:
 def sample_fronts(members: Members, cameras: Cameras, state: FeatureState | None) -> ViewSamples:
     """Sample the foremost Gaussian at the centre of each cell of a grid, in every view.
 
-    The grid has as many cells as that of the ``state``. Without a state the cells of the grid are squares of a fixed
-    size.
+    The grid has as many cells as the grid of the ``state``. Without a state the cells are squares of a fixed size.
     """
     sample_step = 8  # pixels between samples of a view along each axis
     new_shape = -(-cameras.height // sample_step), -(-cameras.width // sample_step)
@@ -246,7 +248,7 @@ def sample_fronts(members: Members, cameras: Cameras, state: FeatureState | None
 def _refine_groups(
     merged: FeatureGaussians, context: NetworkContext, saliency: np.ndarray, samples: ViewSamples, frame: Frame
 ) -> FeatureState:  # fmt: skip
-    """Refine merged Feature Gaussians, and return a state with both, and with the heads' inputs for each group."""
+    """Refine merged Feature Gaussians, and return a state with the merged and the refined ones."""
     refined = context.refine(merged)
     with stage("decode"):
         described = context.describe(refined)
@@ -271,13 +273,13 @@ def _join_batch(
 ) -> FeatureState:  # fmt: skip
     """Match, merge and refine the Feature Gaussians of a state and of a batch; return the new state.
 
-    ``features``, ``saliency``, ``context`` and ``samples`` are those of the batch. Views of the state come first.
+    ``features``, ``saliency``, ``context`` and ``samples`` belong to the batch. Views of the state come first.
     """
     size = state.cameras.width, state.cameras.height
     cameras = concat_cameras(state.cameras, resize_cameras(context.cameras, *size))
     views = features.views + len(state.cameras)
     parts = FeatureGaussians.concat([state.merged, _without_members(replace(features, views=views))])
-    # Each part lists its own row as its only member, so that merged Feature Gaussians list the rows of their parts
+    # The only member of each part is the row of the part, so that merged Feature Gaussians list the rows of their parts
     parts = replace(parts, starts=np.arange(len(parts) + 1), members=np.arange(len(parts)).astype(np.int32))
     part_members = np.concatenate([state.num_members, np.diff(features.starts)])
     all_samples = ViewSamples.concat([state.samples, samples])
@@ -300,12 +302,12 @@ def _mean_of_parts(merged: FeatureGaussians, values: np.ndarray, weights: np.nda
 
 
 def _match_parts(parts: FeatureGaussians, num_old: int, options: MatchOptions) -> Matches:
-    """Match the Feature Gaussians of a batch with each other, as in a scene, and with those of a state.
+    """Match the Feature Gaussians of a batch with each other, as in a scene, and with a state.
 
-    The first ``num_old`` of the ``parts`` are those of the state. Clusters of the matching within the batch and of the
+    The first ``num_old`` of the ``parts`` come from the state. Clusters of the matching within the batch and of the
     matching with the state are joined if they share a part. For the matching with the state, all parts of the state
-    count as one view, and all parts of the batch as another. In this way each part is compared with its nearest
-    neighbours in the other set, which is the batch or the state.
+    count as one view, and all parts of the batch as another. In this way each part of the state is compared with its
+    nearest neighbours in the batch, and vice versa.
     """
     rows = np.arange(len(parts))
     across = match(replace(parts, views=(rows >= num_old).astype(np.int64)), options).clusters
@@ -329,7 +331,9 @@ def _without_members(features: FeatureGaussians) -> FeatureGaussians:
 
 
 def decode_features(state: FeatureState, options: DecodeOptions) -> Gaussians:
-    """Decode a state into ``k`` Gaussians per group in the world frame; with a mixed K, saliency decides their number.
+    """Decode a state into ``k`` Gaussians per group in the world frame.
+
+    With a mixed K, saliency decides how many Gaussians each group gets.
 
     Raises UsageError if the networks' heads make fewer Gaussians per group than ``k``, or if ``k_rule`` needs the
     members of the groups.

@@ -115,7 +115,7 @@ def lock_state(path: Path) -> AbstractContextManager[bool]:
 
 
 def _record_source(state: State, batch_hash: str, comments: Sequence[str]) -> State:
-    """Return a state with the hash of its last batch's files, and with ``comments`` of the files, for results."""
+    """Return a state with the hash of the last batch's files, and with ``comments`` from these files."""
     *earlier, last = state.about["batches"]
     last = last | {"content": batch_hash}
     all_comments = list(dict.fromkeys([*state.about.get("comments", []), *comments]))

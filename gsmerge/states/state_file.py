@@ -51,9 +51,9 @@ class State:
 
 
 def save_state(path: StrPath, state: State, *, overwrite: bool = False, mode: int = 0o666) -> None:
-    """Write a state to a file, completely or not at all; SceneError if the file exists or cannot be written.
+    """Write a state to a file, completely or not at all; raise SceneError if the file exists or cannot be written.
 
-    ``mode``: the most rights of a new file; see :func:`gsmerge.io.atomic.common_mode`.
+    ``mode`` has the most access rights that a new file may have; see :func:`gsmerge.io.atomic.common_mode`.
     """
     if state.scene is not None:
         write_scene(path, state.scene, state.about, overwrite=overwrite, mode=mode)
@@ -95,7 +95,7 @@ def load_state(path: StrPath) -> State:
 
 
 def holds_features(path: Path) -> bool:
-    """Return whether a ``.gsm`` holds Feature Gaussians and not results; SceneError if the file cannot be read."""
+    """Return whether a ``.gsm`` holds Feature Gaussians and not results, or raise SceneError if it is unreadable."""
     return bool(read_header(path)["kind"] != SCENE)
 
 
@@ -138,7 +138,7 @@ def _read_features(file: GsmFile) -> FeatureState:
 
 
 def _read_networks(file: GsmFile) -> NetworkWeights:
-    """Read the networks of a state; SceneError if their options or arrays are damaged."""
+    """Read the networks of a state, or raise SceneError if their options or arrays are damaged."""
     prefix, options = "networks.", file.header.get("networks")
     if not isinstance(options, dict):
         raise file.error(f"expected networks in the header, found {options!r:.40}")
@@ -147,7 +147,7 @@ def _read_networks(file: GsmFile) -> NetworkWeights:
 
 
 def _read_cameras(file: GsmFile) -> Cameras:
-    """Read the cameras of a state; SceneError if poses, intrinsics or the size are impossible."""
+    """Read the cameras of a state, or raise SceneError if poses, intrinsics or the size are impossible."""
     cameras = stored_cameras(file)
     for view, (viewmat, K) in enumerate(zip(cameras.viewmats, cameras.Ks, strict=True)):
         check_camera(file.path, str(view), viewmat, K)
@@ -166,7 +166,7 @@ def _read_samples(file: GsmFile, num_views: int) -> ViewSamples:
 
 
 def _read_numbers(file: GsmFile, name: str, *shape: int) -> np.ndarray:
-    """Return a float32 array of a file; SceneError for numbers so large that later steps would overflow."""
+    """Return a float32 array of a file; raise SceneError for numbers so large that sums overflow."""
     array = file.array(name, np.float32, *shape)
     largest = 1e37  # largest absolute value; float32 ends at 3e38
     if not (np.abs(array).max(initial=0) <= largest):  # NaN fails too
@@ -175,7 +175,7 @@ def _read_numbers(file: GsmFile, name: str, *shape: int) -> np.ndarray:
 
 
 def _read_whole_numbers(file: GsmFile, name: str, count: int, start: int, end: int) -> np.ndarray:
-    """Return whole numbers ``[count]`` of a file; SceneError unless all are from ``start`` to below ``end``."""
+    """Return whole numbers ``[count]`` of a file; raise SceneError unless all are from ``start`` to ``end - 1``."""
     array = file.array(name, np.int64, count)
     if count and not start <= int(array.min()) <= int(array.max()) < end:
         raise file.error(f"{name}: expected numbers from {start} to {end - 1}, found others")

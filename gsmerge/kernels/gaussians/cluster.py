@@ -1,4 +1,4 @@
-"""Measure the overlap of neighbouring Gaussians, and cluster those that overlap."""
+"""Measure the overlap of neighbouring Gaussians, and cluster Gaussians that overlap."""
 
 from __future__ import annotations
 
@@ -55,8 +55,8 @@ def leader_clusters(order, neighbors, scores, views, threshold, max_size):
     """Cluster Gaussians around leaders, so that all Gaussians of a cluster overlap with its leader.
 
     The Gaussians are visited in a given order, and each one that is in no cluster yet becomes a leader. Neighbours that
-    overlap enough and are in no cluster join the leader, those with the most overlap first, at most one from each view.
-    Returns the cluster ``[n]`` int64 of each Gaussian and the number of clusters.
+    overlap enough and are in no cluster join the leader, the largest overlap first, at most one from each view. Returns
+    the cluster ``[n]`` int64 of each Gaussian and the number of clusters.
 
     Args:
         order: ``[n]`` int64 rows of all Gaussians.

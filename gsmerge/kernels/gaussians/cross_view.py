@@ -49,7 +49,8 @@ def nearest_of_others(points, views, order, axes, splits, first, last, most, out
 
     Args:
         points: Points of the tree.
-        views: ``[n]`` int64. A view below 0 differs from all views.
+        views: ``[n]`` int64. A point with a number below 0 belongs to no view, so all other points count as points of
+            other views.
         order, axes, splits: Results of :func:`build_tree`.
         first: First row.
         last: Last row, exclusive.
@@ -88,8 +89,8 @@ def sum_cross_view(
 
     Args:
         colors: ``[g,3]`` float32 base colours minus 0.5.
-        own: ``[g]`` int64 own view of each point, with which it is not compared. Points with a number below 0 are
-            compared with all views.
+        own: ``[g]`` int64 view to which each point belongs, with which the point is not compared. Points with a number
+            below 0 are compared with all views.
         asked: ``[v,most]`` int32 views with which the points of each view are compared.
         width: Width of the views, pixels.
         height: Height of the views, pixels.

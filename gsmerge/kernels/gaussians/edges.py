@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from gsmerge.kernels.signature import STATUS, f4, f8, i8, native, u1
 
-NUM_EDGES = 4  # a photo has this many edges
+NUM_EDGES = 4  # edges of a photo
 
 
 @native(

@@ -29,7 +29,7 @@ def order_by_depth(depths):
 
 
 def project_centres(means, scales, viewmat, K, width, height, near):
-    """Project the centres of Gaussians into a picture, and find those that reach into it.
+    """Project the centres of Gaussians into a picture, and find the Gaussians that reach into the picture.
 
     Args:
         viewmat: ``[4,4]`` float64, world to camera.

@@ -26,10 +26,10 @@ def adam(
 ):  # fmt: skip
     """Change the rows ``ids[first]`` to ``ids[last - 1]`` of parameters ``x [n,COLUMNS]`` by one Adam step.
 
-    Parameters stay in a box around those at the start of the fit, ``x0``. The momentum is Nesterov's, which looks ahead
-    to the first moment of the next step (Dozat, 2016). The components of the mean share one second moment, and so do
-    those of the quaternion, so that steps rotate with the scene. Rows that are not in ``ids`` keep their parameters and
-    moments ``m`` and ``v``.
+    Parameters stay in a box around the parameters ``x0`` at the start of the fit. The momentum is Nesterov's, which
+    looks ahead to the first moment of the next step (Dozat, 2016). The components of the mean share one second moment,
+    and so do those of the quaternion, so that steps rotate with the scene. Rows that are not in ``ids`` keep their
+    parameters and moments ``m`` and ``v``.
 
     Args:
         units: ``[n]`` sizes of the Gaussians at the start, which are the units of their means.

@@ -44,10 +44,10 @@ def pool(starts, ids, means, quats, scales, opacities, sh0, shN, footprints, own
         scales: ``[n,3]`` standard deviations.
         footprints: ``[n]`` sizes of the members' pixels, world units.
         own_covariance: True to add the covariances of the members, with capped extents, to the covariance of their
-            means. If false, only the covariance of the means counts (paper eq. teacher_cov).
+            means. If false, only the covariance of the means counts (teacher_cov in the paper).
         out_geometry: ``[g,13]`` float64, written for groups with members: mean (3), covariance xx xy xz yy yz zz, sum
-            of opacities, mass (paper eq. mass), integrated optical depth and footprint. The optical depth is the sum of
-            -ln(1 - opacity) times disc area.
+            of opacities, mass (as in the paper), integrated optical depth and footprint. The optical depth is the sum
+            of -ln(1 - opacity) times disc area.
         out_sh: ``[g,k,3]`` float32, zero before, written: weighted means of the harmonics.
     """
     longest = int(np.diff(starts).max(initial=0))

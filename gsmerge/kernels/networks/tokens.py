@@ -62,7 +62,7 @@ def describe_parts(
 def correct_features(means, covars, masses, extinctions, sh0, quats, scales, frames, residuals):
     """Apply the corrections ``residuals [g,13]`` to Feature Gaussians in place.
 
-    ``quats`` and ``scales`` are those of Gaussians with the moments of the Feature Gaussians.
+    Gaussians with ``quats`` and ``scales`` have the moments of the Feature Gaussians.
     """
 
 

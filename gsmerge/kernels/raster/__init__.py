@@ -10,5 +10,5 @@ Many kernels take these arrays, which are float32 unless stated otherwise.
 - ``camera [CAMERA]`` describes the camera, see :mod:`gsmerge.kernels.raster.project`.
 
 ``tile_width`` is the number of tiles in a row. ``first`` and ``last`` are a range of tiles or of Gaussians, ``last``
-exclusive. ``height`` and ``width`` are those of the image.
+exclusive. ``height`` and ``width`` are the size of the image.
 """

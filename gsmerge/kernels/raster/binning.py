@@ -63,8 +63,8 @@ def deal_tiles(order, boxes, tile_width, cursors, flatten_ids):
 def deal_open_tiles(order, boxes, conics, tile_width, first, last, left, cursors, flatten_ids):
     """Append Gaussians to the lists of a range of rows of tiles, but leave out hidden Gaussians.
 
-    A list of :func:`deal_tiles` also has the Gaussians behind the one after which all pixels of the tile are opaque.
-    The pixels that are drawn are the same from the lists of both functions.
+    A Gaussian is hidden if all pixels of the tile are already opaque in front of this Gaussian. The lists of
+    :func:`deal_tiles` also have hidden Gaussians, and give the same picture.
 
     Args:
         order: ``[m]`` int32 Gaussians in depth order.

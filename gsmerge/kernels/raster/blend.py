@@ -74,7 +74,9 @@ def contributions(conics, flatten_ids, isect_offsets, tile_width, height, width,
     STATUS, conics=LISTS["conics"], flatten_ids=LISTS["flatten_ids"], left=i8(), top=i8(), parts=i4("n", 3, out=True),
 )  # fmt: skip
 def parts_of_tile(conics, flatten_ids, left, top, parts):
-    """Write the part of a tile in which each Gaussian of a list shows. Other kernels blend only the parts.
+    """Write the part of a tile in which each Gaussian of a list shows.
+
+    Other kernels blend a Gaussian only in this part of the tile.
 
     The tile begins at the pixel (``left``, ``top``). A part is a first row, a last row, and the first of eight columns
     that contain all of the Gaussian, or -1 if eight are too few.

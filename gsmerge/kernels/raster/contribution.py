@@ -48,8 +48,8 @@ def settle_row(bottom, conics, heads, pairs, carried, active, totals, seen, out_
 def dominant_labels(conics, flatten_ids, isect_offsets, tile_width, labels, count):
     """Return each Gaussian's largest sum of blending weights in a superpixel, and the superpixel's label.
 
-    The sums are ``[m]`` float32, and the labels ``[m]`` int32. The smallest label is returned if sums are equal.
-    Gaussians that no pixel shows have 0 and -1.
+    The sums are ``[m]`` float32, and the labels ``[m]`` int32. The smallest label is returned if sums are equal. If no
+    pixel shows a Gaussian, the sum is 0 and the label is -1.
 
     Args:
         labels: ``[h,w]`` int32, below ``count``.

@@ -34,9 +34,9 @@ def room_of(width):
 def loss_gradient(image, photo, weight, ssim_lambda, edge_weight, first, last, gradient, errors, terms, rows):
     """Write the gradient of (1 - ssim_lambda) |e| + ssim_lambda (1 - SSIM) + edge_weight |difference of e|.
 
-    The error e is ``image - photo``. The differences of e are those between each pixel and the next pixel in its row
-    and in its column. Pixels have weights, and a difference has the smaller weight of its two pixels. The windows of
-    SSIM have 7 x 7 pixels of equal weight. Beyond the border all values are zero.
+    The error e is ``image - photo``. The differences of e are between each pixel and the next pixel in its row and in
+    its column. Pixels have weights, and a difference has the smaller weight of its two pixels. The windows of SSIM have
+    7 x 7 pixels of equal weight. Beyond the border all values are zero.
 
     Args:
         image: ``[h,3w]`` float32, with the three channels of a pixel side by side.

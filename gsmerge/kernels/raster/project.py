@@ -8,9 +8,9 @@ the Gaussian::
     ln w(x, y) = lnop - (rate_x (x - mean_x - slope (y - mean_y)))^2 - rate_y (y - mean_y)^2
 
 The backward pass computes gradients of means, rotations, scales and opacities from sums over an image. The backward
-pass follows Ye et al., "Mathematical supplement for the gsplat library", 2023 (EWA: Zwicker et al. 2001). Gradients
-pass through the conic to half axes, rotation and scale. Gradients reach the mean through its image position and through
-the derivative of the projection.
+pass follows "Mathematical supplement for the gsplat library" (Ye 2023) and EWA splatting (Zwicker 2001). Gradients pass
+through the conic to half axes, rotation and scale. Gradients reach the mean through its image position and through the
+derivative of the projection.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Evaluate spherical harmonics, to get the colours that Gaussians show to a camera, and the gradients of these."""
+"""Evaluate spherical harmonics, to get the colours that Gaussians show to a camera, and gradients of the colours."""
 
 from __future__ import annotations
 

@@ -62,7 +62,7 @@ def infer_labels(labels, colours, count):
     """Improve padded labels in place, and return them.
 
     There are as many rounds as the side of a superpixel has pixels. Each of the ``count`` regions is 4-connected and
-    not empty, and stays so. ``colours [h,w,3]`` are CIELAB values divided by 100.
+    not empty, and remains 4-connected and not empty. ``colours [h,w,3]`` are CIELAB values divided by 100.
     """
     height, width, _ = colours.shape
     areas = np.full(count, height * width / count)

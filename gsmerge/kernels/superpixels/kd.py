@@ -28,9 +28,9 @@ def integral_image(pixels):
 # squared error, and its position, 1 to side - 1. The gain is below 0 if the rectangle cannot be cut. Let the rectangle
 # have n pixels whose colours sum to t. A cut at c of the side of length S makes parts with sums s and t - s. The cut
 # lowers the colour error by |S s - c t|² / (n c (S - c)), and the position error by n c (S - c) / 4 times the
-# compactness. near and far are indices in the integral image: near is that of the rectangle's first corner, and far is
-# that of the corner at the other end of the side that is not cut. step is the difference of indices of neighbours along
-# the side that is cut.
+# compactness. near and far are indices in the integral image: near belongs to the rectangle's first corner, and far to
+# the other end of the uncut side from this corner. step is the difference of indices of neighbours along the side that
+# is cut.
 cut_gain = declare(
     "cut_gain", STATUS, integral=f8("places", 3), near=i8(least=0), far=i8(least=0), step=i8(least=1), side=i8(least=0),
     num_pixels=f8(), compactness=f8(), found=f8(2, out=True),

@@ -34,8 +34,8 @@ def region_sums(labels, pixels, depths, count, rows):
     return float(squares[0])
 
 
-# Writes by how much two errors grow if regions u and v merge. The first error is that of colour and depth, and the
-# second error is that of position times the compactness
+# Writes by how much two errors grow if regions u and v merge. The first error is the error of colour and depth, and the
+# second is the error of position times the compactness
 merge_growth = declare(
     "merge_growth", rows=f8("capacity", TREE_COLUMNS), u=i8(least=0, below="capacity"), v=i8(least=0, below="capacity"),
     depth_weight=f8(), compactness=f8(), growth=f8(2, out=True),
@@ -60,7 +60,7 @@ def merge_order(pairs, rows, depth_weight, compactness, max_extent):
         rows: ``[2·leaves,20]`` rows of the leaves, behind which the rows of merged regions are written.
         depth_weight: Weight of squared relative errors of depth, relative to squared differences of colours.
         compactness: Weight of squared distances in pixels, relative to squared differences of colours.
-        max_extent: Merges that make regions with a side of this many pixels come last.
+        max_extent: Merges come last if a side of the merged region has at least so many pixels.
 
     Returns:
         The parent ``[2·leaves-1]`` int32 of each leaf and merge, which is -1 at the root, and the height and the growth

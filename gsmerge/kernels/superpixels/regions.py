@@ -43,9 +43,9 @@ def connectivity_table() -> np.ndarray:
     """Return a table ``[256]`` uint8 that is 1 for rings of neighbours with which a pixel may leave its region.
 
     Bit i of the index is set if neighbour i (N, NE, E, SE, S, SW, W, NW) is in the pixel's region. The region stays in
-    one piece if its neighbours at the sides are 4-connected within the ring. The number of parts that the side
-    neighbours form is their number minus the number of corner neighbours that join two of them (Yokoi's connectivity
-    number). If the whole ring is in the region, this number is 0, although the ring is one part.
+    one piece if its neighbours at the sides are 4-connected within the ring. The number of parts is the number of
+    neighbours at the sides minus the number of corner neighbours that join two of them (Yokoi's connectivity number).
+    If the whole ring is in the region, the formula gives 0, although the ring is one part.
     """
     cells = (np.arange(256)[:, None] >> np.arange(8)) & 1
     edges, corners = cells[:, 0::2], cells[:, 1::2]
@@ -88,8 +88,8 @@ def refine(labels, pixels, count, num_sweeps, spread):
     """Move pixels at borders between regions in place, if this lowers the squared error, and return the padded labels.
 
     Sweeps run forward and backward alternately, until no pixel moves or ``num_sweeps`` are done. Each of the ``count``
-    regions is 4-connected and not empty, and stays so. ``spread`` is the square root of the weight of squared distances
-    in pixels, float32.
+    regions is 4-connected and not empty, and remains 4-connected and not empty. ``spread`` is the square root of the
+    weight of squared distances in pixels, float32.
     """
     rows = region_rows(labels, pixels, count, count, spread)
     num_pixels = rows[:, NUM_PIXELS]
