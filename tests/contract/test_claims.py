@@ -123,14 +123,14 @@ CLAIMS: dict[str, tuple[str, ...]] = {
         f"--effort draft`: {plan.EFFORTS['draft'].steps} steps, no merging across views",
         f"--effort fast`: {plan.EFFORTS['fast'].steps} steps",
         f"--effort best`: {plan.EFFORTS['best'].steps} steps",
-        f"An estimate needs at least {word(left_out.LEAST_VIEWS)} photos, a result with at most"
+        f"The estimate of the gain needs at least {word(left_out.LEAST_VIEWS)} photos, a result with at most"
         f" {percent(new_views.MOST_SHARE)} as many Gaussians as pixels",
         f"the depth of {confirm_depths.CONFIRM_PIXELS:,} pixels of each view is compared with its nearest views, up to"
         f" {confirm_depths.CONFIRM_NEIGHBORS} of them",
         f"If the nearest views confirm clearly less than {part(confirm_depths.POOR_SHARE)} of the compared depths",
         f"shows its photos more than {metrics.MAX_LOSS:g} dB worse than the input",
         f"and less than {distance.WRONG_DB:g} dB of PSNR",
-        f"to show the photos at most {plan.FIDELITY_LOSS:g} dB worse than the input does",
+        f"if it shows the photos at most {plan.FIDELITY_LOSS:g} dB worse than the input does",
         f"at least {plan.FIDELITY_PSNR:g} dB against the input's",
         f"moved by up to {cameras_off.MAX_PX:g} pixels, in small pictures by up to {percent(cameras_off.MAX_SHARE)}",
         f"If the views miss {percent(draw_outside.LEAST_OUTSIDE)} of the Gaussians or more",
@@ -151,8 +151,8 @@ CLAIMS: dict[str, tuple[str, ...]] = {
         f"the input's opacity is below {fog.FOG_EMPTY:g} in the whole square of {fog.EROSION_PIXELS} x"
         f" {fog.EROSION_PIXELS} pixels around this pixel",
         f"the mean depth in the result is below {fog.VEIL_SHARE:g} of the input's",
-        f"with an opacity above {fog.FOG_SOLID:g} in the input: the share with an opacity below {fog.FOG_OPEN:g} in"
-        " the result",
+        f"with an opacity above {fog.FOG_SOLID:g} in the input that have an opacity below {fog.FOG_OPEN:g} in the"
+        " result",
         f"A long thin Gaussian is at least {word(int(fog.RATIOS[0]))} times as long as its second axis",
         f"it is longer than {percent(fog.LONG)} of the picture's width",
         f"A fit has up to {outside.PLACES} outside cameras, or as many as photos if there are more photos",
@@ -163,7 +163,7 @@ CLAIMS: dict[str, tuple[str, ...]] = {
         f"gsmerge keeps at most {SHARE.replace('%', ' %')} of a scene",
         f"at most what the device draws fluidly: {', '.join(f'{count:,}' for count in DEVICES.values())}",
         f"| `--k` | 1 to {MAX_CHILDREN} | this number for each superpixel; 1 by default, {plan.LONE_K} for a single",
-        f"counts PSNR plus {curve.SSIM_DB:g} dB times SSIM",
+        f"measures quality as PSNR plus {curve.SSIM_DB:g} dB times SSIM",
         f"The useful number of Gaussians is {percent(confirm_depths.MOST_PER_PIXEL)} of the input if other views"
         f" confirm at least {percent(confirm_depths.SOUND_SHARE)} of the depth, and {percent(confirm_depths.FEWEST)} if"
         f" they confirm {percent(confirm_depths.WRONG_SHARE)} or less",
@@ -186,7 +186,7 @@ CLAIMS: dict[str, tuple[str, ...]] = {
         f"Of more than {data.MAX_SHOWN_VIEWS} views",
         f"or {' x '.join(map(str, drawings.PLACED_SIZE))} without cameras",
         f"at most {drawings.GIF_SIDE} pixels a side",
-        f"a second shows {drawings.FPS:g} of them, or {drawings.GIF_FPS:g} of a GIF",
+        f"a second shows {drawings.FPS:g} frames, or {drawings.GIF_FPS:g} frames of a GIF",
     ),
     SHARP: (f"Each photo needs {register.MIN_MATCHES} points in common with another one",),
     CONVENTIONS: (
