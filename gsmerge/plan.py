@@ -241,7 +241,7 @@ def _decide(prepared: Prepared, filled: FilledOptions, checkpoint: Checkpoint | 
         checkpoint=checkpoint,
         settings=replace(options, budget=original.budget).to_dict() | {"fit_steps": fit.steps},
         free_poses=options.prepare.poses == "free",
-        # Without a fit, new views look as good as own photos, so they need no estimate
+        # Without a fit, new views look as good as the views of the input, so they need no estimate
         new_views=fit.fit != "none" and options.effort != "draft" if options.new_views is None else options.new_views,
     )
 
@@ -323,7 +323,7 @@ def choose_blocks(scene: SceneSize, options: CompactOptions) -> int:
 def usual_blocks(num_gaussians: int, num_views: int) -> int:
     """Return the number of blocks that a scene has by default.
 
-    A scene of which only the views are many has at most this number.
+    If the views alone decide the number, it is an upper limit.
     """
     if num_gaussians > WHOLE_GAUSSIANS:
         return -(-num_gaussians // BLOCK_GAUSSIANS)
@@ -333,7 +333,7 @@ def usual_blocks(num_gaussians: int, num_views: int) -> int:
 def wanted_blocks(options: CompactOptions, num_gaussians: int, num_views: int = 0) -> int:
     """Return the largest number of blocks that a run may have by its options; 1 for a run in one piece.
 
-    ``num_views`` only matters if it is large.
+    A small ``num_views`` does not change the number.
     """
     blocks = options.blocks.blocks
     if blocks == "auto":
@@ -346,9 +346,9 @@ def keeps_fidelity(scene: SceneSize, options: CompactOptions) -> bool:
 
     The run searches if the options do not decide the number, and the scene has no photos or few Gaussians per pixel.
     With few Gaussians per pixel, no usual share of the Gaussians is right: a scene that is compact already needs most
-    of its Gaussians, and a scene of many small Gaussians needs only a few. Without photos the PSNR of the result
-    against the input has to be ``FIDELITY_PSNR``. With photos the result may show the photos ``FIDELITY_LOSS`` worse
-    than the input. Measurements are in docs/internals/notebook.md.
+    of its Gaussians, and a scene of many small Gaussians needs only a few. Without photos, the PSNR of the result
+    against renders of the input has to be ``FIDELITY_PSNR``. With photos, the PSNR of the result on the photos may be
+    ``FIDELITY_LOSS`` dB lower than that of the input. Measurements are in docs/internals/notebook.md.
     """
     # with half a Gaussian per pixel or more, the usual share of them is enough to show the photos
     is_dense = scene.has_own_pixels or scene.num_gaussians >= 0.5 * scene.num_views * scene.pixels_per_view > 0
@@ -474,7 +474,7 @@ def _resolve_clean(options: CleanOptions, prepared: Prepared) -> CleanOptions:
 def resolve_decode(options: CompactOptions, scene: SceneSize) -> DecodeOptions:
     """Choose K if the option is "auto": 4 if all views have the same camera and no long fit follows, otherwise 1.
 
-    A single view has too few Gaussians with K = 1, because superpixels are only 4.4 % of its pixels. With several
+    A single view has too few Gaussians with K = 1, because it has only 4.4 superpixels per 100 pixels. With several
     cameras, each surface gets Gaussians from several views.
     """
     decode = options.decode

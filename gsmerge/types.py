@@ -259,7 +259,7 @@ class Pixels(ArrayFields):
     Args:
         homes: ``[n]`` int, the pixel in which each Gaussian is most visible; -1 if no view sees the Gaussian.
         fronts: ``[v,h,w]`` int32, the front Gaussian of each pixel; -1 for none.
-        own: Each view has Gaussians of its own, one or more for a pixel, with the colours of its photo.
+        own: Each Gaussian comes from a pixel of one view, with the colours of the view's photo.
     """
 
     homes: np.ndarray
@@ -413,7 +413,7 @@ class Scene(ArrayFields):
 
     @property
     def has_own_pixels(self) -> bool:
-        """Return whether each view is known to have Gaussians of its own, with the colours of its photo."""
+        """Return whether each Gaussian is known to come from one view, with the colours of this view's photo."""
         return self.pixels is not None and self.pixels.own
 
     def get_pixels(self) -> Pixels:
@@ -425,7 +425,7 @@ class Scene(ArrayFields):
     def covered(self) -> np.ndarray | None:
         """Mask ``[v,h,w]`` of the pixels for which the file has a Gaussian.
 
-        None if the file has a Gaussian for every pixel, or if views have no Gaussians of their own.
+        None if the file has a Gaussian for every pixel, or if Gaussians do not come from single views.
         """
         if self.pixels is None or not self.pixels.own or (self.filled is None and self.pixels.shown.all()):
             return None
@@ -434,7 +434,7 @@ class Scene(ArrayFields):
 
     @property
     def is_shown(self) -> bool:
-        """Return whether the views have pictures, which are photos or the colours of the views' own Gaussians."""
+        """Return whether the views have pictures, which are photos or the colours of the pixels' Gaussians."""
         return self.has_own_pixels or self.images is not None
 
     @property
@@ -454,7 +454,7 @@ class Scene(ArrayFields):
 
     @property
     def num_gaussians(self) -> int:
-        """Number of Gaussians of the file; budgets and ratios refer to this number."""
+        """Number of Gaussians in the file; budgets and ratios refer to this number."""
         return len(self.gaussians) - (0 if self.filled is None else int(self.filled.sum()))
 
     @property
@@ -480,7 +480,7 @@ def make_scene(gaussians: Gaussians, cameras: Cameras) -> Scene:
 def fill_pixels(scene: SceneT, added: Gaussians, empty_pixels: np.ndarray) -> SceneT:
     """Add Gaussians to a scene that fill holes, each in an empty pixel.
 
-    ``empty_pixels [n]`` has the pixel of each, numbered over all views.
+    ``empty_pixels [n]`` has the pixel of each added Gaussian, numbered over all views.
     """
     count, old_pixels = len(scene.gaussians), scene.get_pixels()
     homes, fronts = old_pixels.homes, old_pixels.fronts.copy()

@@ -27,7 +27,7 @@ JOBS = Setting("", kind=int | Literal["auto"], least=1)
 MAX_LISTED = 20  # rows of the table, failures, and doubtful results
 TABLE_HEADER = ("result", "Gaussians", "of", "kept", "new views", "own before", "own after", "seconds")
 OMITTED_FIRST = ("of", "seconds", "own before", "own after", "kept")  # columns that a narrow terminal omits, in order
-# Kinds of reasons that are listed for scenes -> word before each line, and noun with which the others are counted
+# Kind of a reason -> word that begins its line, and noun for counting the lines that are not listed
 REASONS = {
     "doubt": ("warning", "warning"), "unmet": ("missed target", "missed target"), "lacking": ("note", "note"),
     "error": ("failed", "failure"),

@@ -28,8 +28,8 @@ def join_reports(
 ) -> CompactReport:
     """Make the report of the whole scene, whose PSNR is the mean of the blocks' PSNR, weighted by their views.
 
-    ``psnrs`` has the PSNR (dB) of the result on the photos of each block, or None without photos. Seconds and notes are
-    those of the current record. If the result may be worse than the input, result and input are scored again on all
+    ``psnrs`` has the PSNR (dB) of the result on the photos of each block, or None without photos. Seconds and notes
+    come from the current record. If the result may be worse than the input, result and input are scored again on all
     photos.
     """
     run, num_views = current_record(), [len(start.block.own) for start in starts]

@@ -258,8 +258,8 @@ def _clean_fitted(fitted: Fitted, prepared: Prepared, plan: Plan) -> tuple[Gauss
     """Clean up fitted Gaussians; return the remaining Gaussians, and the number of dropped Gaussians by reason."""
     from gsmerge.stages.clean import clean
 
-    # Cameras that were placed for scores are too few to show all of the scene. Without cameras, `clean` places cameras
-    # of its own
+    # Cameras that were placed for scores are too few to show all of the scene. If `clean` gets no cameras, it places
+    # enough to show the whole scene
     cameras = None if prepared.reference.placed else fitted.cameras[sorted({*prepared.repeated})]
     rows, dropped = clean(fitted.gaussians, plan.clean, cameras, prepared.scene.images, prepared.frame.leave)
     return fitted.gaussians[rows], dropped

@@ -37,7 +37,7 @@ COST_STEP = 0.1  # per million pixels of its view
 COST_DRAWN = 0.25  # per million Gaussians that it draws
 THREAD_GAIN = 0.35  # speed of each thread after the first, relative to the first
 TRIAL_SHARE = 0.25  # cost of the trial that estimates new views, as a share of building the result
-# Number of candidates that a search usually builds, if photos score them, and if renders of the input do
+# Number of candidates that a search usually builds: first, if photos score them; second, if renders of the input do
 USUAL_BUILDS, USUAL_BUILDS_OF_RENDERS = 3, 1
 INSIDE_GAUSSIANS = 10_000  # sample of Gaussians for the mean share that lies inside a view
 PLACED_PIXELS = 1 << 18  # largest number of pixels of a placed view
@@ -45,7 +45,7 @@ PLACED_PIXELS = 1 << 18  # largest number of pixels of a placed view
 
 @dataclass(frozen=True)
 class CountChoice:
-    """How a run chooses the number of Gaussians; by default, the options state the number."""
+    """How a run chooses the number of Gaussians. If no field is set, the options state the number."""
 
     has_target: bool = False  # Several candidates are built until one reaches a PSNR
     has_curve: bool = False  # The scene's curve decides, unless ``has_target`` or ``rendered``

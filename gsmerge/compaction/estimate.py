@@ -44,9 +44,10 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
         result shows the photos at most ``loss_kept`` dB worse than the input. If ``quality`` is given, the run takes
         more or fewer Gaussians until this quality is met. ``ratio`` is ``num_gaussians`` relative to the input, and
         ``bytes`` is the size as a ``.ply``. ``superpixels_per_view`` is None if a budget distributes superpixels among
-        the views, and 0 if neighbours are merged. ``blocks``, ``method``, ``k``, ``match``, ``checkpoint``, ``fit`` and
-        ``fit_steps`` are those of the run. ``seconds`` and ``memory_bytes`` have two digits, and are right within a
-        factor of about two. ``memory_problem`` says that this machine has too little memory, or is None.
+        the views, and 0 if neighbouring Gaussians are merged instead of superpixels. ``blocks``, ``method``, ``k``,
+        ``match``, ``checkpoint``, ``fit`` and ``fit_steps`` are the values that the run would use. ``seconds`` and
+        ``memory_bytes`` have two digits, and are right within a factor of about two. ``memory_problem`` says that this
+        machine has too little memory, or is None.
     """
     if options.clean.crop is not None:
         scene = crop_scene(scene.numpy(), options.clean.crop)

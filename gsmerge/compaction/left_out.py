@@ -78,7 +78,7 @@ def leave_out(scene: PicturedScene, views: Sequence[int], prepared: Prepared) ->
 
 
 def mean_seen(scores: np.ndarray, shares: np.ndarray) -> float:
-    """Return the mean of the scores ``[v]`` of left-out photos, weighted by the ``shares [v]`` that other views see.
+    """Average the scores ``[v]`` of left-out photos, weighted by the ``shares [v]`` of each that other views see.
 
     A photo does not count if other views see almost nothing of it.
     """
@@ -97,7 +97,7 @@ def choose_left_out(views: Sequence[int]) -> tuple[list[int], list[int]]:
 
 
 def can_leave_out(prepared: Prepared) -> bool:
-    """Return whether some views can be left out: enough views have photos, and views have Gaussians of their own."""
+    """Return whether some views can be left out: enough views have photos, and each Gaussian comes from one view."""
     reference = prepared.reference
     has_photos = reference.name == PHOTOS and len(reference.score_views) >= LEAST_VIEWS
     return has_photos and prepared.scene.has_own_pixels

@@ -105,8 +105,9 @@ def mark_inside_and_seen(points: np.ndarray, cameras: Cameras, depths: np.ndarra
 def count_factors(blocks: Sequence[Block], covisibility: Covisibility) -> np.ndarray:
     """Return for each block the factor on its number of Gaussians that makes all blocks equally dense.
 
-    Some Gaussians on surfaces of a block belong to pixels of views outside it, so the block is built without them. The
-    number of Gaussians from the block's own views is then multiplied by the factor.
+    Some Gaussians on surfaces of a block belong to pixels of views outside the block, and the block is built without
+    these Gaussians. To make up for them, the number of Gaussians from the block's own views is multiplied by the
+    factor.
     """
     views = range(len(covisibility.cameras))
     owners = owning_views(covisibility.samples, covisibility, views)
@@ -123,8 +124,9 @@ def count_factors(blocks: Sequence[Block], covisibility: Covisibility) -> np.nda
 def partition_views(weights: np.ndarray, count: int) -> list[Block]:
     """Cut v views into ``count`` blocks of similar size, with weak edges between them.
 
-    ``weights [v,v]`` of the edges are symmetric and at least 0. Every view belongs to one block. A block also shares
-    the views of other blocks that have the largest weights with it, up to ``SHARED`` times the number of its own views.
+    ``weights [v,v]`` of the edges are symmetric and at least 0. Every view belongs to one block. A block also gets
+    views of other blocks, those with the largest weights to its own views, up to ``SHARED`` times the number of its own
+    views.
     """
     labels = grow_blocks(weights, count)
     blocks = []

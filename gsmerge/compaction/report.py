@@ -88,7 +88,7 @@ class CompactReport:
             if the PSNR is not measured.
         covered: PSNR over the pixels that the input covers; None if the input covers at least 98 % of all pixels.
         is_far: The result is clearly worse than the input. Either the result's pictures differ from the photos more
-            than twice as much as the input's pictures. Or, between the views, the result's pictures differ from the
+            than twice as much as the input's pictures do. Or, between the views, the result's pictures differ from the
             input's pictures more than twice as much as the input's pictures differ from the photos.
         photo_files: PSNR on the photos as they are in their files; None if the run changed no photo.
         protected: PSNR over the pixels that ``protect`` marks, and their share of all pixels; None without such pixels.
@@ -309,7 +309,7 @@ def curve_lines(document: Mapping[str, Any]) -> list[str]:
 def _scores_on_files(document: Mapping[str, Any]) -> Mapping[str, float] | None:
     """Return the PSNR on the photos as they are in their files, before and after.
 
-    None if these numbers are printed the same as the PSNR on the photos that the run changed.
+    None if both numbers are printed equal to the PSNR on the changed photos.
     """
     on_files, own = document.get("psnr_photo_files"), document["psnr_input_views"]
     if on_files is None or own["after"] is None or any(f"{on_files[name]:.2f}" != f"{own[name]:.2f}" for name in own):

@@ -31,8 +31,8 @@ NEAR_DB = 0.6
 PHOTOS_NEAR_DB = 0.2
 MAX_BUILDS = 6  # most builds of a search
 MAX_LEFT_OUT_BUILDS = 3  # most builds of a search by left-out photos, in addition to the build of the result
-# A PSNR that is more than this many dB above the target is lowered to this value, because a larger one, such as that of
-# the whole input, says little about the slope near the target
+# A PSNR that is more than this many dB above the target is lowered to this limit, because a much higher PSNR, such as
+# that of the whole input, says little about the slope near the target
 FAR_DB = 6.0
 
 T = TypeVar("T")
@@ -116,8 +116,8 @@ class CountSearch:
     def count(self) -> int | None:
         """The number of Gaussians that the search has chosen: that of the best candidate.
 
-        With left-out photos the number is the one at which these photos reach the target, which may lie between the
-        counts of two candidates.
+        With left-out photos, it is the number at which the PSNR of these photos reaches the target. This number may lie
+        between the counts of two candidates.
         """
         if self.plan.target_psnr is None or self.left_out is None:
             return self.best.count
@@ -149,7 +149,7 @@ class CountSearch:
         if target is None:
             return SearchFacts(seconds, {}, self.notes, None)
         best, met, left_out = self.best, self.is_met, 0 if self.left_out is None else len(self.left_out.photos)
-        # at a count between those of two candidates, the PSNR is expected to be that of the target
+        # if the count lies between the counts of two candidates, its PSNR is expected to be the target
         psnr = best.deciding_psnr if self.count == best.count else target
         choices: dict[str, Any] = {
             "search": {
@@ -215,8 +215,8 @@ def add_target(plan: Plan, prepared: Prepared) -> Plan:
 def search_count(prepared: Prepared, plan: Plan, build: Build) -> CountSearch:
     """Return the search for the number of Gaussians, before its first build.
 
-    Without a quality target, the search has one count. If the scene's curve decides the number, the curve is measured
-    here.
+    Without a quality target, the search builds one count only. If the scene's curve decides the number, the curve is
+    measured here.
     """
     limits, left_out = plan.limits, leave_out_for_scores(prepared, plan)
     agreement, most = prepared.agreement, limits.max_count
@@ -254,8 +254,8 @@ def leave_out_for_scores(prepared: Prepared, plan: Plan) -> LeftOut | None:
 def build_left_out(build: Build, left_out: LeftOut, plan: Plan, count: int | None) -> Candidate:
     """Build a candidate from the views that remain, by a ``plan`` for them, and score it on the left-out photos.
 
-    ``count`` is the number of Gaussians for all views. The candidate has a part of this number, in proportion to its
-    views.
+    ``count`` is the number of Gaussians for all views. The candidate has a part of ``count``, in proportion to its
+    number of views.
     """
     assert count is not None
     begin_part()
@@ -312,8 +312,8 @@ def next_count(
         width = float(log(above / below))  # of the interval between the two counts, on a logarithmic scale
         rise = (min(psnrs[above], target + FAR_DB) - psnrs[below]) / width
         step = (target - psnrs[below]) / rise if rise > 0 else width / 2
-        # The count is a little larger than interpolated, to reach the target, and not so near to either built count
-        # that its PSNR says nothing new
+        # The count is a little larger than interpolated, to reach the target, and far enough from both built counts to
+        # say something new
         return round(below * float(exp(min(max(step + 0.1 * width, 0.15 * width), 0.85 * width))))
     if above is None and len(psnrs) > 1:
         first, last = sorted(psnrs)[-2:]

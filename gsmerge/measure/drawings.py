@@ -173,7 +173,7 @@ def prepare_panel(options: DrawOptions) -> Drawing:
         if shown and options.size:
             shown = [None if photo is None else fill_photo(photo, *options.size) for photo in shown]
         rows = view_pictures(named, cameras[ids], shown, names, background=options.background)
-        # A scene without cameras has placed views: the first half is around the scene, and the second half inside it
+        # If the scene has no cameras, gsmerge placed the views, the first half around the scene, the others inside it
         outer_cameras = cameras if group.load.cameras is not None else cameras[: len(cameras) // 2]
         outside = outside_pictures(named, outer_cameras, photos=shown is not None, background=options.background)
         yield contact_sheet([*rows, outside])
@@ -288,9 +288,9 @@ DRAWINGS = {"panel": prepare_panel, "views": prepare_pictures, "path": prepare_c
 
 
 def _read_scenes(options: DrawOptions, *, photos: bool) -> DrawnScenes:
-    """Read the scenes, and the cameras of ``options.framing``, which show them.
+    """Read the scenes, and from ``options.framing`` the cameras that show the scenes.
 
-    If ``photos``, also read photos of the framing.
+    If ``photos``, also read the photos of these cameras.
     If there are no cameras, views are placed around the scene, and if ``photos`` also inside it.
     """
     files, framing, paths = options.files, options.framing, options.paths

@@ -165,7 +165,7 @@ class _Split:
     drawn: Gaussians | None = None  # the input, if its renders replace photos; otherwise None
 
     def move_to(self, cameras: Cameras | None) -> _Split:
-        """Return the split with a result's own cameras. Renders of the input keep the cameras that drew them."""
+        """Return the split with the cameras of a result. Renders of the input keep the cameras that drew them."""
         view_cameras = self.views.cameras if cameras is None or self.drawn is not None else cameras
         return replace(self, views=replace(self.views, cameras=view_cameras))
 
@@ -203,10 +203,10 @@ def evaluate(
     Args:
         scene: The input. Without photos, results are compared with renders of the scene.
         results: Results of :func:`gsmerge.compact`, or Gaussians, by name, in the scene's world.
-        targets: Held-out views in that world, see :func:`gsmerge.scene.held_out.read_held_out`.
+        targets: Held-out views in the scene's world, see :func:`gsmerge.scene.held_out.read_held_out`.
         options: Settings; None: the defaults, with LPIPS if its weights are installed.
-        cameras: Cameras of the input views, by name of a result, if the result was made with other poses than the
-            scene has. A result has these cameras as ``CompactResult.cameras``.
+        cameras: Cameras of the input views, by name of a result, for results that were made with other poses than the
+            scene's. Such a result has these cameras as ``CompactResult.cameras``.
         progress: Called with (name of the step, number done, total); the step of a result is "evaluate: NAME".
         on_image: Called with (result, split, number of the view in the split, render ``[h,w,3]`` in [0, 1]).
 
@@ -321,8 +321,8 @@ def _make_splits(
 ) -> dict[str, _Split]:
     """Return the input views and the held-out views by the name of the split, with the pixels that count.
 
-    Input views have the scene's pictures, which ``reference`` describes. A scene without pictures gets renders of the
-    Gaussians ``inputs`` in their place.
+    Input views have the scene's pictures, which ``reference`` describes. If the scene has no pictures, renders of the
+    Gaussians ``inputs`` replace them.
     """
     side = renderer.options.photo_side
     cameras = shrink_cameras(scene.cameras, side)
@@ -330,7 +330,7 @@ def _make_splits(
     points = context_points(scene, renderer.near, sources)
 
     def make_split(views: Views, words: str, masks: np.ndarray | None = None) -> _Split:
-        """Return a split; ``words`` describe the pictures of its views, and pixels outside ``masks`` do not count."""
+        """Return a split; ``words`` describe the pictures of the views, and pixels outside ``masks`` do not count."""
         visible, scored = visible_pixels(points, views.cameras, renderer.near, sources), list(range(len(views.names)))
         if masks is not None:
             visible &= [resize_mask(mask, cameras.width, cameras.height) for mask in masks]
@@ -363,8 +363,8 @@ def _score_split(
     """Draw and score all results, one view after the other.
 
     Returns, by the name of each result, the seconds of drawing and the score of each view. A split is a set of views:
-    the input views, or held-out ones. ``kind`` is its name. ``cameras`` has the cameras of the results that were made
-    with other poses than the scene has.
+    the input views, or held-out ones. ``kind`` is its name. If a result was made with other poses than the scene's,
+    ``cameras`` has its cameras.
     """
     options, names = renderer.options, split.views.names
     lpips_views = pick_views(len(names), options.lpips_views or len(names))

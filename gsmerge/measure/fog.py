@@ -46,18 +46,19 @@ FOG_NEAR_PLANE = 0.25  # near plane of the depths of both scenes, as a share of 
 class Fog:
     """Fog, veils, holes and spikes of a result, seen from outside and compared with its input.
 
-    A figure is None if there is no pixel on which it can be measured.
+    A figure is None if it can be measured on no pixel.
 
     Args:
         fog_near: Mean opacity, in [0, 1], where the input is empty.
-        fog_far: Mean opacity of the pixels that are farther than a tenth of the width from all that the input shows.
+        fog_far: Mean opacity of the pixels that are more than a tenth of the width away from every pixel in which the
+            input shows anything.
         holes: Share of the pixels with a solid input in which the result has an opacity below a half.
         veil: Share of the pixels with a solid input in which the depth of the result is less than 0.7 of the input's
             depth. This share is a mean over the cameras.
         veil_worst: The largest veil of a single camera.
         spikes: Share of the pixels that change visibly if all spikes are removed. A spike is longer than 5 % of the
             width, and at least five times as long as its second axis.
-        strokes: Like ``spikes``, but with spikes that are at least three times as long as their second axis.
+        strokes: Like ``spikes``, but a spike is at least three times as long as its second axis.
     """
 
     fog_near: float | None = None

@@ -125,7 +125,8 @@ def collect_page_data(
     ``results`` are Gaussians by name in the scene's world, and may be empty. ``file_bytes`` are the file sizes of the
     scene and of the results. Stills and scores use ``cameras`` (see :func:`gsmerge.evaluate`); 3D uses the scene's
     cameras. ``new_gains`` says, by result, how much better new views are expected to be: a lower and an upper bound in
-    dB. A result that is worse than the scene gets no gain. If ``light``, the scene itself is shown in stills only.
+    dB. For a result that is worse than the scene, no gain is shown. If ``light``, the scene itself is shown in stills
+    only.
     """
     stills: Stills = {}
 
@@ -185,7 +186,7 @@ def _fill_page(
 def _with_gains(data: ViewData, gains: Mapping[str, tuple[float, float]]) -> ViewData:
     """Return the content with the expected gains of results.
 
-    A result that shows the photos of the fit worse than the scene does gets a note in place of a gain.
+    If a result shows the photos of the fit worse than the scene does, it gets a note instead of a gain.
     """
     sides, notes = [], list[str]()
     for side in data.sides:
@@ -203,7 +204,7 @@ def _with_gains(data: ViewData, gains: Mapping[str, tuple[float, float]]) -> Vie
 def _list_views(
     splits: Mapping[str, SplitViews], evaluation: Evaluation, stills: Stills, frame: Frame, means: np.ndarray
 ) -> list[PageView]:
-    """List the measured views of all splits. The ``distance`` of each is the median depth of ``means [n,3]``."""
+    """List the measured views of all splits. A view's ``distance`` is the median depth of ``means [n,3]`` in it."""
     views: list[PageView] = []
     for split, (cameras, photos, names) in splits.items():
         encoded: list[bytes | None] = [encode_still(to_picture(photo)) for photo in photos]
@@ -258,7 +259,7 @@ def encode_still(picture: BytePicture) -> bytes:
 def _pack_side(
     gaussians: Gaussians, name: str, scene: Scene, cameras: Cameras, light: bool
 ) -> tuple[bytes | None, int, int]:
-    """Pack one side's Gaussians for the page; return the bytes, the SH degree in the page, and that in the file.
+    """Pack one side's Gaussians for the page; return the bytes, and the SH degrees in the page and in the file.
 
     ``gaussians`` and ``cameras`` are in the canonical frame. A ``light`` page leaves out the Gaussians of the scene
     itself, and the bytes are then None.

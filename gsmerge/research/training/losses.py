@@ -3,8 +3,8 @@
 All Feature Gaussians that reach into a window of a photo run through all networks, and the window is rendered from them
 (paper section 4.6). Pixels that the scene does not cover have no loss, so networks need not guess them. LPIPS has the
 values of :mod:`gsmerge.measure.lpips`, and torch can differentiate it. Two regularizers act in early training. One
-regularizer penalises Gaussians that are far from the moments of their groups, which are the paper's teacher. The other
-regularizer penalises children of one group that lie upon each other.
+penalises Gaussians that are far from the moments of their groups (the "teacher" of the paper). The other penalises
+children of one group that lie upon each other.
 """
 
 from __future__ import annotations
@@ -157,7 +157,7 @@ def teacher_loss(prediction: Prediction, members: Members) -> Tensor:
     The teacher of a group is one Gaussian with the opacity-weighted mean and covariance of its members' means
     (equations teacher_mean and teacher_cov), the members' mean colour, and the opacity that conserves the members'
     optical depth. The loss is the angle between the rotations plus L1 distances of means, logarithms of scales,
-    opacities and base colours. The unit of the distance of means is the teacher's size. A Gaussian has 24 equivalent
+    opacities and base colours. Distances between means are in units of the teacher's size. A Gaussian has 24 equivalent
     pairs of rotation and scales, of which the pair nearest to the prediction is used.
     """
     g, merged = prediction.gaussians, prediction.merged

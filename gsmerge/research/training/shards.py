@@ -67,7 +67,7 @@ def prepare_shards(
 
 
 def _scene_shards(scene: Path, options: TrainOptions, folder: Path) -> list[Shard]:
-    """Return the shards of one scene; make them and their record if there is no complete record."""
+    """Return the shards of one scene; first make the shards and their record if there is no complete record."""
     key, name = scene_key(scene, options), example_name(scene)
     record = folder / f"{key[:32]}.json"
     hashes = _read_hashes(record)

@@ -98,7 +98,7 @@ class TrainOptions(Settings):
 
     @property
     def example_views(self) -> tuple[int, ...]:
-        """Numbers of views: each scene gives an example for each number; 0 stands for all views."""
+        """Numbers of views. Each scene gives one example for each of these numbers; 0 stands for all views."""
         return (0,) if self.random_views else self.views
 
     def match_options(self) -> MatchOptions:
