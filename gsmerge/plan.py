@@ -1,7 +1,7 @@
-"""The plan of a run: the one place that reads "auto", effort, budget, recipe and checkpoint names.
+"""The plan of a run: only this module reads "auto", effort, budget, recipe and checkpoint names.
 
 Every choice is a function here. :func:`make_plan` makes all choices for a prepared scene or block.
-:func:`choose_for_scene` makes only the choices that need no computation, which estimates and scenes in blocks use. Each
+:func:`choose_for_scene` makes only the choices that need no computation, for estimates and for scenes in blocks. Each
 stage gets its own part of the plan, and no stage knows the options of another.
 """
 
@@ -56,7 +56,7 @@ NO_FIT = "without cameras a draft has no fit: --effort fast has one"
 BLOCK_GAUSSIANS = 8_000_000  # Gaussians of a block's own views, if the number of blocks is automatic
 WHOLE_GAUSSIANS = 20_000_000  # Gaussians up to which a scene is compacted in one piece, unless it has many views
 BLOCK_VIEWS, WHOLE_VIEWS = 42, 168  # the same two limits as numbers of views, if blocks see little of each other
-LONE_K = 4  # K if all views have the same camera, because no other view adds Gaussians of its own to a surface
+LONE_K = 4  # K if all views have the same camera, because no other view adds Gaussians to a surface
 
 
 @dataclass(frozen=True)
@@ -176,8 +176,9 @@ class FilledOptions:
 def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoint | None = None) -> Plan:
     """Make all decisions about a run that the options leave open.
 
-    The networks are also loaded, because some decisions depend on them. ``checkpoint``: networks to use instead of
-    those that the options name. Raises UsageError if the scene or the networks do not allow what the options ask for.
+    The networks are also loaded, because some decisions depend on them. ``checkpoint`` has networks to use instead of
+    the networks that the options name. Raises UsageError if the scene or the networks do not allow what the options ask
+    for.
     """
     check_pictures(prepared, options)
     with stage("prepare"):
@@ -350,7 +351,7 @@ def keeps_fidelity(scene: SceneSize, options: CompactOptions) -> bool:
     against renders of the input has to be ``FIDELITY_PSNR``. With photos, the PSNR of the result on the photos may be
     ``FIDELITY_LOSS`` dB lower than that of the input. Measurements are in docs/internals/notebook.md.
     """
-    # with half a Gaussian per pixel or more, the usual share of them is enough to show the photos
+    # with half a Gaussian per pixel or more, the usual share of the Gaussians is enough to show the photos
     is_dense = scene.has_own_pixels or scene.num_gaussians >= 0.5 * scene.num_views * scene.pixels_per_view > 0
     may_keep = scene.rendered or options.budget.keep or not (is_dense or options.budget.auto)
     return may_keep and options.scene_decides
@@ -368,10 +369,10 @@ def check_pictures(prepared: Prepared, options: CompactOptions) -> None:
 
 
 def choose_networks(options: CompactOptions, size: SceneSize) -> str:
-    """Return the name of the checkpoint to load: that of the options or, if it is "auto", "shipped" or "none".
+    """Return the name of the checkpoint in the options or, if this name is "auto", "shipped" or "none".
 
-    The shipped networks improve the result if no fit follows, and if the views have photos or pixels. A fit gains more
-    if it takes further steps in the time of the networks (docs/internals/networks.md).
+    The shipped networks improve the result if no fit follows, and if the views have photos or pixels. With a fit,
+    further steps gain more than networks that take the same time (docs/internals/networks.md).
     """
     if options.checkpoint != "auto":
         return options.checkpoint
@@ -422,8 +423,8 @@ def check_networks(checkpoint: Checkpoint, options: CompactOptions) -> None:
 def resolve_budget(size: SceneSize, options: CompactOptions, agreement: Agreement | None) -> CompactOptions:
     """Fill in the number of Gaussians beyond which new views gain nothing, with a note.
 
-    The more the views confirm each other's depth, the larger is this number of Gaussians. The number is the budget if
-    the options say "auto", and an upper limit for a budget that is a share, a size or a device.
+    The more the views confirm each other's depth, the larger is this number of Gaussians. If the budget is "auto", it
+    becomes this number. If the budget is a share, a size or a device, this number is its upper limit.
     """
     budget = options.budget
     is_limit = budget.is_limit and options.method == OURS
@@ -489,7 +490,7 @@ def resolve_decode(options: CompactOptions, scene: SceneSize) -> DecodeOptions:
 
 
 def resolve_fit(options: CompactOptions) -> FitOptions:
-    """Fill in the number of steps by effort, and keep Gaussians that no photo shows in a draft without a fit."""
+    """Fill in the number of steps by effort. In a draft without a fit, keep Gaussians that no photo shows."""
     fit, effort = options.fit, EFFORTS[options.effort]
     steps = effort.steps if fit.fit_steps is None else fit.fit_steps
     prunes = fit.fit != "none" or effort.prunes
@@ -499,8 +500,8 @@ def resolve_fit(options: CompactOptions) -> FitOptions:
 def steps_for(options: CompactOptions, num_views: int, share: float = USUAL_SHARE) -> int:
     """Return the number of steps of the full fit.
 
-    The number follows from effort, number of views and ``share``, unless the options state the number. ``share``:
-    Gaussians of the result for each pixel. A step draws one view. Measurements are in docs/internals/large-scenes.md.
+    Unless the options state it, the number follows from effort, number of views and ``share``, the result's number of
+    Gaussians per pixel. A step draws one view. Measurements are in docs/internals/large-scenes.md.
     """
     if options.fit.fit_steps is not None:
         return options.fit.fit_steps
@@ -532,7 +533,7 @@ def _fit_renders(prepared: Prepared, options: CompactOptions, fit: FitOptions) -
     """Fill in the settings of a fit to renders of the input.
 
     Long thin Gaussians are allowed, because the input may have them. The fit is not scored on held-out patches.
-    Gaussians beyond all views, and those that hardly show in any view, are kept, because they belong to the scene.
+    Gaussians beyond all views, and Gaussians that hardly show in any view, are kept, because they belong to the scene.
     """
     if prepared.reference.placed and fit.fit == "none" and options.fit.fit != "none":
         note(NO_FIT)
@@ -543,8 +544,8 @@ def _fit_renders(prepared: Prepared, options: CompactOptions, fit: FitOptions) -
 def _choose_scored_views(prepared: Prepared, effort: Effort | None) -> tuple[int, ...]:
     """Choose the views that score input and result, among those whose pictures show the scene.
 
-    ``effort`` decides how many views the report needs. None: the views decide the number of Gaussians, which takes more
-    views than a report.
+    ``effort`` decides how many views the report needs. None: the scores of the views decide the number of Gaussians,
+    which takes more views than a report.
     """
     own = own_views(prepared)
     if prepared.reference.placed:

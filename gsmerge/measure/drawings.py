@@ -103,7 +103,7 @@ class Drawing:
 
 @dataclass(frozen=True, eq=False)
 class DrawnScenes:
-    """Scenes to draw together. All scenes are in the frame of one scene, and are drawn in the views of this scene."""
+    """Scenes to draw together. All scenes share the frame of one scene, and are drawn in its views."""
 
     scenes: list[tuple[Path, Gaussians]]
     sizes: list[int]  # bytes of their files
@@ -124,8 +124,9 @@ class DrawnScenes:
     ) -> Iterator[tuple[BytePicture, ...]]:
         """Yield, for each camera, the 8-bit pictures of all scenes, with one view per thread in memory.
 
-        ``borders`` are those of each picture, see :func:`gsmerge.measure.clip.swipe_borders`. Scene i is shown between
-        the borders i and i + 1. Other columns of its picture need not be drawn, and may show the background only.
+        ``borders`` are the borders in each picture, see :func:`gsmerge.measure.clip.swipe_borders`. Scene i is shown
+        between the borders i and i + 1. Other columns of its picture need not be drawn, and may show the background
+        only.
         """
         settings: dict[str, Any] = {"at_once": threads, "near": near, "convert": to_picture}
         drawn = (
@@ -144,8 +145,8 @@ class DrawnScenes:
 def frame_files(files: SceneFiles, cameras: StrPath | None, images: StrPath | None) -> SceneFiles:
     """Find the files of the scene that defines the frame of the cameras.
 
-    For a compacted scene this is its source ``NAME.ply``, if that lies beside it. For any other scene it is the scene
-    itself. ``cameras`` and ``images`` are the options of the user.
+    For a compacted scene this is the source ``NAME.ply``, if it lies beside the compacted scene. For any other scene it
+    is the scene itself. ``cameras`` and ``images`` are the options of the user.
     """
     match = re.fullmatch(r"(.+)\.compact(\.level\d+)?(\.compressed)?\.(ply|spz|sog|splat|glb)", files.ply.name)
     if match is None or not (source := files.ply.with_name(f"{match[1]}.ply")).is_file():

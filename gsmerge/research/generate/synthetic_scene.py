@@ -146,7 +146,7 @@ class _PhotoSession:
     def predict(self, place: int, photo: Float, deviation: Array, seed: int) -> tuple[Array, Gaussians]:
         """Simulate the network for the photo of a place on the path.
 
-        Return the pose and the Gaussians that it estimates.
+        Return the pose and the Gaussians that the network would estimate.
         ``deviation [2,3]`` is the random error of the pose, see :func:`_perturb_pose`.
         """
         hits = trace(self.lit.shapes, self.poses[place], self.lens, 1)
