@@ -22,8 +22,8 @@ class Covered:
     """PSNR over the pixels of the input views that the input covers, if it does not cover all.
 
     Args:
-        share: Share of the scored pixels that the input covers. An input file with rows for some pixels only covers
-            these pixels; any other input covers the pixels in which its opacity is at least a half.
+        share: Share of the scored pixels that the input covers. If the input file has rows for only some pixels, it
+            covers these pixels. Any other input covers the pixels in which its opacity is at least a half.
         before: Mean PSNR (dB) of the covered pixels, rendered from the input.
         after: Mean PSNR (dB) of the covered pixels, rendered from the result.
     """
@@ -36,7 +36,7 @@ class Covered:
 def compared_psnr(
     covered: Covered | None, before: float | None, after: float | None
 ) -> tuple[float | None, float | None]:
-    """Return the PSNR (dB) of input and result that are compared with each other.
+    """Return the PSNR (dB) of the input and of the result, for comparing the two.
 
     If the input does not cover all pixels, the PSNR is over the pixels that the input covers.
     """
@@ -254,7 +254,8 @@ def result_table(document: Mapping[str, Any], next_step: str | None = None, *, c
     """
     rows = result_facts(document)
     figures = text_table([row[:3] for row in rows], "  ")
-    # a line that is broken continues below its explanation, or below its first value in a narrow terminal
+    # a broken line continues in the column of its explanation or, in a narrow terminal, in the column of its first
+    # value
     indent = len(figures[0]) + 2 if (columns or 80) > 2 * len(figures[0]) + 4 else 13
     lines = [(f"{left}  {row[3]}".rstrip(), indent) for left, row in zip(figures, rows, strict=True)]
     lines += [(line, 2) for line in (*level_lines(document), *curve_lines(document))]
@@ -265,7 +266,7 @@ def result_table(document: Mapping[str, Any], next_step: str | None = None, *, c
 
 
 def _describe_fidelity_views(fidelity: Mapping[str, Any]) -> str:
-    """Return words for the views in which the PSNR against the input was measured."""
+    """Name the views in which the PSNR against the input was measured."""
     return f"from the input in {fidelity['views']} {'held-out' if fidelity['held_out'] else 'of its'} views"
 
 

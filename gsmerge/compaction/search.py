@@ -41,7 +41,7 @@ T = TypeVar("T")
 def build_in_turn(build: Callable[[int], T], first: T, choose_next: Callable[[list[T]], int | None]) -> list[T]:
     """Build one candidate after another, and return all of them; ``first`` is built already.
 
-    ``choose_next`` returns the next count, by all candidates so far, or None to end.
+    ``choose_next`` gets all candidates so far, and returns the next count, or None to end.
     """
     built = [first]
     while (count := choose_next(built)) is not None:
@@ -56,7 +56,7 @@ class SearchFacts:
     seconds: dict[str, float]  # Wall time by stage, of all candidates
     choices: dict[str, Any]
     notes: list[str]
-    unmet: str | None  # Why the target is not met; None if it is, or if there is none
+    unmet: str | None  # Why the target is not met; None if it is met, or without a target
 
 
 @dataclass(eq=False)
@@ -64,10 +64,10 @@ class CountSearch:
     """Search for the number of Gaussians: the search builds one count, or several until a quality is met."""
 
     plan: Plan  # Has the target and the limits
-    first: int | None  # The count to begin with; None: as many as `superpixels` and K give
+    first: int | None  # The first count to build; None: as many as `superpixels` and K give
     rendered: bool = False  # Candidates are scored on renders of the input, which more Gaussians always show better
-    left_out: LeftOut | None = None  # Candidates are fitted without these photos and scored on them; None: on all views
-    most: int | None = None  # Beyond this count, left-out photos gain nothing; None: the plan has the only limit
+    left_out: LeftOut | None = None  # Photos for scores, which fits of candidates leave out; None: all views score
+    most: int | None = None  # Count above which left-out photos gain nothing; None: only the plan has a limit
     candidates: list[Candidate] = field(default_factory=list)  # Candidates built so far
 
     def run(self, build: Callable[[int | None], Candidate]) -> None:
@@ -114,7 +114,7 @@ class CountSearch:
 
     @property
     def count(self) -> int | None:
-        """The number of Gaussians that the search has chosen: that of the best candidate.
+        """The number of Gaussians that the search has chosen, which is usually the number of the best candidate.
 
         With left-out photos, it is the number at which the PSNR of these photos reaches the target. This number may lie
         between the counts of two candidates.
@@ -231,8 +231,8 @@ def search_count(prepared: Prepared, plan: Plan, build: Build) -> CountSearch:
 def leave_out_for_scores(prepared: Prepared, plan: Plan) -> LeftOut | None:
     """Leave out views, so that their photos can score candidates or a curve; None if no view is left out.
 
-    Views are left out if a quality target or the curve decides the count, because a fit shows the photos that it has
-    seen better than new ones. No view is left out without a fit, or if candidates only have to be as good as the input.
+    Views are left out if a quality target or the curve decides the count, because a fit shows new photos worse than the
+    photos that it has seen. No view is left out without a fit, or if candidates only have to be as good as the input.
     """
     has_target = plan.target_psnr is not None and not plan.keeps_fidelity
     if plan.fit.fit == "none" or not (has_target or plan.max_drop is not None or plan.auto_count):
@@ -252,7 +252,7 @@ def leave_out_for_scores(prepared: Prepared, plan: Plan) -> LeftOut | None:
 
 @record_part()
 def build_left_out(build: Build, left_out: LeftOut, plan: Plan, count: int | None) -> Candidate:
-    """Build a candidate from the views that remain, by a ``plan`` for them, and score it on the left-out photos.
+    """Build a candidate from the remaining views, by a ``plan`` for these views, and score it on the left-out photos.
 
     ``count`` is the number of Gaussians for all views. The candidate has a part of ``count``, in proportion to its
     number of views.
@@ -290,9 +290,9 @@ def next_count(
 ) -> int:
     """Choose the next count to build in the search for the fewest Gaussians that reach a PSNR, within 15 %.
 
-    If a count that was built already is near enough, it is returned, and the search ends. The PSNR is assumed to rise
-    with the logarithm of the count. The next count is interpolated between the nearest counts on both sides of the
-    target, or extrapolated from one side.
+    If a count that was built already is near enough, this count is returned, and the search ends. The PSNR is assumed
+    to rise with the logarithm of the count. The next count is interpolated between the nearest counts on both sides of
+    the target, or extrapolated from one side.
 
     Args:
         psnrs: PSNR (dB) by count, of at least one count.

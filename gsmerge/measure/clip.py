@@ -116,8 +116,8 @@ def swipe_borders(count: int, frames: int, fps: float, width: int) -> list[list[
 def draw_swipe(pictures: Sequence[BytePicture], borders: Sequence[int], captions: Sequence[Caption]) -> BytePicture:
     """Make a frame from columns of pictures of several scenes, each with its caption, and draw lines between them.
 
-    All pictures are from one camera. ``borders`` are the borders of the columns, see :func:`swipe_borders`. The captions
-    are drawn into the pictures themselves.
+    All pictures are from one camera. ``borders`` are the borders of the columns, see :func:`swipe_borders`. The
+    captions are drawn into the pictures themselves.
     """
     frame = np.empty_like(pictures[0])
     lines_per_width = 480  # a line is as wide as a frame divided by this

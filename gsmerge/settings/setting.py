@@ -104,7 +104,7 @@ class Setting:
         return join_words([*texts, *map(str, self.words)])
 
     def _describe_range(self, kind: type) -> str:
-        """Describe the possible numbers in a text, such as "a whole number from 1 to 8"."""
+        """Describe the possible numbers in words, such as "a whole number from 1 to 8"."""
         low = f"above {_number(self.above)}" if self.least is None else _number(self.least)
         high = f"below {_number(self.below)}" if self.most is None else _number(self.most)
         if self.least is None and self.above is None:

@@ -136,7 +136,7 @@ class TrainOptions(Settings):
         return asdict(self) | {name: list(getattr(self, name)) for name in LIST_OPTIONS}
 
 
-# The paper's hyperparameters: its table, and sections 4.1, 4.4 and 5.1. Settings that the paper does not state have
+# Hyperparameters from the paper's table and its sections 4.1, 4.4 and 5.1. Settings that the paper does not state have
 # their defaults, except for the densities.
 PAPER: Mapping[str, Any] = {
     "outputs": "absolute",
