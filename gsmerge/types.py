@@ -201,7 +201,8 @@ class LargePhotos(ArrayFields):
     width: int
     height: int
     ids: tuple[int, ...]  # Number of each view's photo, for `read`
-    # Number -> [height,width,3] uint8 sRGB; several threads may call it. Each scene that is read gets a new function
+    # Number of a photo -> [height,width,3] uint8 sRGB; several threads may call it. Each scene that is read gets a new
+    # function
     read: Callable[[int], np.ndarray] = field(compare=False)
 
     def __getitem__(self, views: Sequence[int]) -> LargePhotos:
@@ -337,7 +338,7 @@ def _check_count(what: str, values: Sequence[Any], count: int) -> None:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Scene(ArrayFields):
-    """Gaussians, and the views from which they were made or that see them.
+    """Gaussians, and the views from which they were made or in which they are seen.
 
     The Gaussians are the rows of a file that are finite and not empty. If reading finds the pixel of each row, the
     scene has ``pixels``; otherwise :func:`gsmerge.facts.pixels.find_pixels` finds them later.
@@ -459,7 +460,7 @@ class Scene(ArrayFields):
 
     @property
     def file_gaussians(self) -> Gaussians:
-        """The Gaussians of the file, without those that were added to fill holes."""
+        """The Gaussians of the file, without the Gaussians that were added to fill holes."""
         if self.filled is None:
             return self.gaussians
         count = self.num_gaussians
@@ -533,7 +534,7 @@ class Segmentation:
 
     groups: Groups  # Superpixels of every view
     count: int  # Largest number of Gaussians in the result
-    exact: bool  # True if exactly this number was requested
+    exact: bool  # True if exactly ``count`` Gaussians were requested
 
 
 @dataclass(frozen=True, eq=False)
@@ -548,9 +549,9 @@ class Matches:
 class FeatureGaussians:
     """g Gaussians that each represent a group of members, with facts about the group for later stages.
 
-    Columns that describe a group are sums over its members (weights, masses, extinctions), or means with these weights.
-    Feature Gaussians are merged by the same sums and means. The opacity is computed when Feature Gaussians are decoded,
-    as ``1 - exp(-gain * extinction / disc area)``, because blending conserves the integrated optical depth. In
+    Columns that describe a group are sums over its members (weights, masses, extinctions), or means weighted by one of
+    these. Feature Gaussians are merged by the same sums and means. The opacity is computed when Feature Gaussians are
+    decoded, as ``1 - exp(-gain * extinction / disc area)``, because blending conserves the integrated optical depth. In
     training, columns that networks change are tensors.
     """
 
@@ -591,10 +592,10 @@ class FeatureGaussians:
 
 @dataclass(frozen=True, eq=False)
 class Decoded:
-    """Canonical Gaussians that a fit starts from."""
+    """Canonical Gaussians with which a fit starts."""
 
     gaussians: Gaussians  # Canonical Gaussians
-    count: int  # Number to which the fit may grow
-    exact: bool  # True if the result must have exactly this number
+    count: int  # Number of Gaussians that the fit may reach by adding some
+    exact: bool  # True if the result must have exactly ``count`` Gaussians
     fixed: np.ndarray | None = None  # [n] bool, Gaussians that the fit does not change; None: none
-    is_input: bool = False  # True if these are all Gaussians of the scene, unchanged
+    is_input: bool = False  # True if the scene's Gaussians are all here, unchanged

@@ -65,7 +65,7 @@ def _open_streams() -> None:
 
 
 def stop_at_once(*_: object) -> NoReturn:
-    """Print a line and end the process: the handler of SIGINT while there is nothing to clean up, as during imports."""
+    """Print a line and end the process. This handles SIGINT while there is nothing to clean up, as during imports."""
     with suppress(OSError):
         os.write(2, b"gsmerge: error: interrupted\n")
     os._exit(INTERRUPTED)

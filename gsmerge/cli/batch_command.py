@@ -145,7 +145,7 @@ def _run_jobs(args: opt.Args, jobs: Sequence[Job], options: BatchOptions, totals
             if args.json:
                 print(json.dumps(record, separators=(",", ":")), file=stdout, flush=True)
             failure, num_skipped = record["error"] or "", totals.counts[SKIPPED]
-            # scenes that are skipped take no time, so they do not count
+            # skipped scenes take no time, so the time left is estimated without them
             share = 1.0 if num_ended == len(jobs) else (num_ended - num_skipped) / (len(jobs) - num_skipped)
             report = record["report"] or {"notes": record["doubts"]}  # a result that was done before has no report
             notes = [Doubt(note) if note in record["doubts"] else note for note in report["notes"]]
@@ -153,7 +153,7 @@ def _run_jobs(args: opt.Args, jobs: Sequence[Job], options: BatchOptions, totals
 
 
 def check_failures(failed: Sequence[tuple[str, str]], total: int, unit: str, *, listed: bool = False) -> None:
-    """Raise BatchError if jobs ``failed`` (name, reason), of ``total`` jobs that messages count as ``unit``.
+    """Raise BatchError if jobs ``failed`` (name, reason). ``unit`` is the word for one of the ``total`` jobs.
 
     The message has the first reason, unless all reasons have been ``listed`` already.
     """
@@ -176,7 +176,7 @@ class Totals:
     total: int  # scenes
     counts: Counter[str] = field(default_factory=Counter)  # scenes by status; "in" and "out": Gaussians
     rows: list[tuple[str, ...]] = field(default_factory=list)  # rows of the table, for the first results
-    # Kind of reason -> scenes with their reasons. Skipped results also count, with their doubts and missed targets
+    # Kind of reason -> scenes with their reasons. Doubts and missed targets of skipped results also count
     reasons: dict[str, list[tuple[str, str]]] = field(default_factory=lambda: {name: [] for name in REASONS})
 
     def add(self, record: Mapping[str, Any]) -> None:

@@ -101,7 +101,7 @@ def input_files(files: SceneFiles) -> tuple[Path, ...]:
 
 
 def write_texts(texts: Mapping[Path, str | bytes], mode: int = 0o666) -> None:
-    """Write texts to files, all of them or none; existing files are replaced.
+    """Write texts to files, either all or none; existing files are replaced.
 
     ``mode``: permissions of new files, of which the user's mask may take some away.
     """

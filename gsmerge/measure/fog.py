@@ -1,9 +1,10 @@
 """Measure fog, veils, holes and spikes: errors of a compact scene that only show from outside the views.
 
-Photos score a scene from their own viewpoints only, but a person who views the scene first steps back and turns. From
-outside, Gaussians in gaps between the views show as haze, and Gaussians of wrong depth show as veils before surfaces.
-Gaps in surfaces show as holes. Long thin Gaussians, which look like texture in one view, show as strokes. Photos are
-not needed, only the input and the cameras of its views. docs/guide/evaluate.md explains the figures to users.
+Photos score a scene only from the viewpoints of the photos, but a person who views the scene first steps back and
+turns. From outside, Gaussians in gaps between the views show as haze, and Gaussians of wrong depth show as veils before
+surfaces. Gaps in surfaces show as holes. Long thin Gaussians, which look like texture in one view, show as strokes.
+Photos are not needed, only the input and the cameras of its views. docs/guide/evaluate.md explains the figures to
+users.
 """
 
 from __future__ import annotations
@@ -88,8 +89,8 @@ def measure_fog(
 ) -> dict[str, dict[str, Fog]]:
     """Measure fog, veils, holes and spikes of results, by name, from outside the ``cameras`` of a ``reference`` scene.
 
-    Returns, by the name of a result and the kind of camera, a :class:`Fog` of all pictures of this kind. Kinds are
-    those of :data:`FOG_CAMERAS`, and "all". ``near`` is the near plane of the pictures, in world units.
+    Returns, by the name of a result and the kind of camera, a :class:`Fog` of all pictures of this kind. Kinds are the
+    keys of :data:`FOG_CAMERAS`, and "all". ``near`` is the near plane of the pictures, in world units.
     """
     reference_splats = make_splats(reference)
     splats = {name: make_splats(result) for name, result in results.items()}
@@ -134,7 +135,7 @@ def fog_cameras(gaussians: Gaussians, cameras: Cameras) -> Iterator[tuple[str, C
 
 
 def draw_depths(splats: Splats, camera: Cameras, near: float, depth_near: float) -> OutsidePicture:
-    """Draw the opacities of one outside camera with the near plane ``near``, and with the plane ``depth_near``.
+    """Draw the opacities in one outside camera twice, with ``near`` and with ``depth_near`` as the near plane.
 
     Depths are drawn with ``depth_near`` only. Both planes are in world units.
     """
@@ -184,8 +185,8 @@ def mean_fog(sums: np.ndarray) -> Fog:
     """Make the figures of a :class:`Fog` from ``sums [pictures,6,2]`` of several pictures.
 
     A picture has the four rows of :func:`sum_pixels`, and the two rows of :func:`count_spikes`. A figure is the sum
-    over all pictures, divided by the number of these pictures' pixels. For veils, each picture's sum is divided by the
-    picture's pixels, and the shares are then averaged.
+    over all pictures, divided by the number of pixels over which it was taken. Veils are divided picture by picture,
+    and the shares are then averaged.
     """
     near, far, holes, _, *spikes = (total / count if count else None for total, count in sums.sum(0).tolist())
     veils = [total / count for total, count in sums[:, 3].tolist() if count]

@@ -54,10 +54,10 @@ class PageView:
     """A view that the page can jump to."""
 
     name: str
-    place: int  # index among all views, of which the input views are first
+    place: int  # index among all views; the input views come first
     held_out: bool
     camera: Cameras  # one camera, in the page's frame
-    distance: float  # median depth of the scene, in units of that frame
+    distance: float  # median depth of the scene in the view, in units of the page's frame
     photo: bytes | None  # WebP
     stills: tuple[bytes, ...]  # WebP, one for each side
     scores: tuple[Quality, ...]  # one for each side, over the pixels that the input views have seen
@@ -70,7 +70,7 @@ class ViewData:
 
     title: str  # name of the scene
     sides: tuple[Side, ...]  # the scene itself, then its results
-    views: tuple[PageView, ...]  # the worst first, by the scores of the first result; without results, of the scene
+    views: tuple[PageView, ...]  # the worst first, by the scores of the first result or, without results, of the scene
     outside: PageView  # the view from outside the capture
     num_views: int  # number of measured views; `views` may have fewer
     reference: str  # words for the pictures against which scores are measured
@@ -80,7 +80,7 @@ class ViewData:
 
     @property
     def shown(self) -> tuple[PageView, ...]:
-        """All views that the page can jump to: the measured ones, then the view from outside."""
+        """All views that the page can jump to: the measured views, then the view from outside."""
         return (*self.views, self.outside)
 
     @property
