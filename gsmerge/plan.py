@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from gsmerge.networks.weights import NetworkWeights
     from gsmerge.raster.photos import PhotoScore
 
-AUTO_STEPS = 2  # steps relative to the usual, if budget auto leaves the count to the curve: few Gaussians need them
+AUTO_STEPS = 2  # with budget auto, steps relative to the usual number: the curve may choose few Gaussians, which need more
 SHORT_STEPS = 60  # a fit with at most this many steps still gains from a better start
 MOST_STEPS = 2.0  # most steps for more than the usual share of Gaussians per pixel, relative to the usual steps
 USUAL_VIEWS = 12  # views up to which the steps of an effort are enough
@@ -55,7 +55,7 @@ FIDELITY_LOSS = 0.3
 NO_FIT = "without cameras a draft has no fit: --effort fast has one"
 BLOCK_GAUSSIANS = 8_000_000  # Gaussians of a block's own views, if the number of blocks is automatic
 WHOLE_GAUSSIANS = 20_000_000  # Gaussians up to which a scene is compacted in one piece, unless it has many views
-BLOCK_VIEWS, WHOLE_VIEWS = 42, 168  # the same two limits as numbers of views, if blocks see little of each other
+BLOCK_VIEWS, WHOLE_VIEWS = 42, 168  # the two limits above as numbers of views, if blocks see little of each other
 LONE_K = 4  # K if all views have the same camera, because no other view adds Gaussians to a surface
 
 
@@ -69,9 +69,9 @@ class Effort:
     merges: bool = True  # Merge Gaussians of different views
     refines: bool = True  # With `checkpoint="auto"`, run all networks, not only the heads
     prunes: bool = True  # Without a fit, leave out Gaussians that no photo shows
-    fits_alone: bool = True  # Fit scenes without cameras, to views that are placed for it
+    fits_alone: bool = True  # Fit scenes without cameras, to views that gsmerge places
     large_photos: bool = True  # With `photo_scale="auto"`, allow photos larger than the views
-    report_views: int = REPORT_VIEWS  # Views that input and result are scored on for the report alone
+    report_views: int = REPORT_VIEWS  # Number of views for scores that only the report needs
 
 
 EFFORTS = {
@@ -101,13 +101,13 @@ class Plan:
     levels: int  # Levels of detail
     output: str  # Name of the output's file, whose format may round values; "": no file
     size: FileSize | None  # Largest size of the output's file; None: any
-    scored_views: tuple[int, ...]  # Given views that input and result are scored on
-    seed: int  # Everything random depends on it alone
+    scored_views: tuple[int, ...]  # Ids of the views in which input and result are scored
+    seed: int  # All random choices depend on this number alone
     checkpoint: Checkpoint | None  # Networks, from a file; None: closed formulas alone
     settings: dict[str, Any]  # All settings by flat name, for reports
     power: float = POWERS[0]  # Power of the masses by which pairs are merged
-    free_poses: bool = False  # The options ask for moved cameras, even where the scene does not need it
-    samples: bool = False  # A sample of the pixels is scored, because only the report needs the scores
+    free_poses: bool = False  # The options ask the fit to move cameras, even if the scene does not need it
+    samples: bool = False  # Only a sample of the pixels is scored, because only the report needs the scores
     new_views: bool = False  # Estimate the quality of new views
     is_trial: bool = False  # The result is only scored on left-out photos, so gaps need not be filled
     before: PhotoScore | None = None  # Score of the input, if the result has to keep its quality on photos
@@ -163,7 +163,7 @@ class FilledOptions:
 
     original: CompactOptions  # The options of the caller
     options: CompactOptions  # With K, and with a budget that the scene can use
-    segment: SegmentOptions  # With numbers that depend on effort and scene
+    segment: SegmentOptions  # With the numbers that depend on effort and scene filled in
     clean: CleanOptions  # Without the sky, if no photo shows where it is
 
     @property
@@ -220,7 +220,7 @@ def _decide(prepared: Prepared, filled: FilledOptions, checkpoint: Checkpoint | 
     # a quality that the user asks for is measured on all pixels, and small views have too few tiles for a sample
     samples = not (keeps or target is not None) and scored_tiles(0, cameras.width, cameras.height, 2) is not None
     builds_several = keeps or target is not None or budget.max_drop is not None or budget.auto or budget.levels > 1
-    # all builds cut the views by one tree of regions
+    # all builds of a run share one tree of regions, by which they cut the views
     shares_tree = cuts_views(options, size) and not merges_pairs and (builds_several or limits.count is not None)
     return Plan(
         superpixels=SuperpixelChoices(segment, limits, start_share(fit), SharedTree() if shares_tree else None),
@@ -440,7 +440,7 @@ def resolve_budget(size: SceneSize, options: CompactOptions, agreement: Agreemen
         reason = f"more would not show new views better, because {why}; --set fill=true takes the whole budget"
         note(f"budget {budget.budget}: {limit}; {reason}")
         is_only_count = options.changed_counts == ["budget"]
-        if is_only_count and agreement.share <= FEWEST:  # the limit is then the number without a budget
+        if is_only_count and agreement.share <= FEWEST:  # a run without a budget would have the same number
             budget = replace(budget, budget=None)
     return replace(options, budget=replace(budget, most=most))
 

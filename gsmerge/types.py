@@ -322,7 +322,7 @@ class Region(ArrayFields):
     half: np.ndarray  # [3] half of each side of a box; three times the same radius for a sphere
     axes: np.ndarray  # [3,3] rotation into the directions of the sides
     is_sphere: bool
-    rounding: float = 0.0  # Error of rounded positions in files; moved positions stay this far inside the border
+    rounding: float = 0.0  # Error of rounded positions in files; moved positions keep this distance from the border
 
 
 def number_views(count: int) -> tuple[str, ...]:

@@ -256,7 +256,7 @@ def run(args: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         return 1
     except Exception as error:
-        if signals or isinstance(error.__cause__, KeyboardInterrupt):  # a library has made an error of the interruption
+        if signals or isinstance(error.__cause__, KeyboardInterrupt):  # a library has raised it as an error
             return end_by_signal()
         return end_with(*_explain(error))
 

@@ -278,7 +278,7 @@ def _print_plan(args: opt.Args, jobs: Sequence[Job], options: BatchOptions, note
 
     out, pending = args.output, pending_jobs(jobs, args.output, options)
     concurrency = choose_concurrency(jobs, options)
-    pending_scenes = {job.scene: refusal for job, refusal in pending}  # a refusal of None: would be compacted
+    pending_scenes = {job.scene: refusal for job, refusal in pending}  # None: the scene would be compacted
     num_refused = sum(refusal is not None for refusal in pending_scenes.values())
     num_pending = len(pending) - num_refused
     document = {

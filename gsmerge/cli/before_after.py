@@ -71,7 +71,7 @@ def read_before_after(args: Args, files: SceneFiles) -> BeforeAfter:
     from gsmerge.io.scene_files import result_cameras
     from gsmerge.runtime.record import record_run
 
-    if files.cameras is None and "cameras" not in files.named:  # a result may have cameras that its scene lacks
+    if files.cameras is None and "cameras" not in files.named:  # a result may have cameras although its scene has none
         files = replace(files, cameras=next(filter(None, map(result_cameras, args.after)), None))
     load = args.load(files)
     views = vars(args).get("views")

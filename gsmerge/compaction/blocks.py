@@ -59,7 +59,7 @@ BLOCK_SURPLUS = 1.03  # Gaussians of all blocks, relative to the requested numbe
 
 
 def cut_views(scene: Scene, options: CompactOptions, count: int) -> tuple[list[Block], Covisibility]:
-    """Cut the views of a scene into ``count`` blocks; also return what each view sees of the others.
+    """Cut the views of a scene into ``count`` blocks; also return how much each view sees of every other view.
 
     If the user asks for blocks, or the memory is too small for one piece, there are ``count`` blocks. If the only
     reason is the number of views, there may be fewer blocks, down to one.
@@ -108,7 +108,8 @@ def compact_in_blocks(
             joined, owners = join_parts([start.gaussians for start in starts])
             growth = sum(start.count for start in starts) / max(1, len(joined))
             if limit is not None and options.budget.is_filled:
-                # Blocks drop new Gaussians that belong to other blocks, so all need a surplus to reach the number
+                # Blocks drop new Gaussians that belong to other blocks, so each block needs a surplus to reach its
+                # number
                 growth = max(growth, BLOCK_SURPLUS * limit / max(1, len(joined)))
         shared_start = work.share((joined, owners))
         fitted = list(adopt_records(work.run("fit", fit_block, count, list_calls(starts, shared_start, growth))))

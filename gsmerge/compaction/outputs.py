@@ -47,7 +47,7 @@ class Outputs:
 
 
 def name_outputs(result: Path, options: FileOptions | None = None, *, overwrite: bool = False) -> Outputs:
-    """Return the paths of the files of an output. Cameras get a file of their own if the format cannot hold them.
+    """Return the paths of the files of an output. Cameras get a separate file if the format cannot hold cameras.
 
     Raises UsageError if the name has no ending that can be written, or if the options do not fit the format.
     """

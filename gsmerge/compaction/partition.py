@@ -1,7 +1,7 @@
 """Cut a scene into blocks of views that see the same surfaces; each block also gets some views of its neighbours.
 
 Views are nodes of a graph. The weight of an edge says how much two views see of each other's surfaces. Blocks grow one
-after another. A block begins at the border of the views that are left, and each step adds the view that shares most
+after another. A block begins at the border of the remaining views, and each step adds the view that shares most
 surfaces with the block.
 """
 
@@ -29,7 +29,7 @@ def gaussians_at_once(num_gaussians: int, blocks: int) -> int:
 
 @dataclass(frozen=True)
 class Block:
-    """Views that are compacted together: the block's own, and further ones shared with neighbouring blocks."""
+    """Views that are compacted together: the views that belong to the block, and views of neighbouring blocks."""
 
     own: tuple[int, ...]  # Its own views, ascending
     shared: tuple[int, ...]  # Views of other blocks that see the same surfaces, ascending
@@ -59,7 +59,7 @@ class Covisibility:
 
 
 def measure_covisibility(scene: Scene) -> Covisibility:
-    """Measure, for every two views, which share of the surfaces of one view the other one sees.
+    """Measure, for every two views, which share of the surfaces in one view the other view sees.
 
     Surfaces that are hidden in a view are not seen by it. The scene must have pixels.
     """
@@ -169,7 +169,7 @@ def grow_blocks(weights: np.ndarray, count: int) -> np.ndarray:
             labels[view], is_free[view] = label, False
             block_weights += weights[view]
             block_weights[view] = -np.inf
-            # prefer views with weak edges to other free ones, so that no view remains alone
+            # prefer views with weak edges to other free views, so that no view remains alone
             free_weights -= weights[view]
             score = block_weights - 0.5 * np.where(is_free, free_weights, 0)
             view = int(score.argmax())

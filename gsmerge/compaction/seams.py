@@ -1,4 +1,4 @@
-"""Fit the seams between blocks: Gaussians that views of several blocks show are fitted again, to all these views."""
+"""Fit the seams between blocks: Gaussians in views of several blocks are fitted again, to all these views."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def fit_seams(joined: Gaussians, owners: np.ndarray, starts: Sequence[BlockStart
 def find_seams(
     joined: Gaussians, owners: np.ndarray, starts: Sequence[BlockStart]
 ) -> tuple[np.ndarray, list[list[int]]]:
-    """Return a mask ``[n]`` of Gaussians at seams and, for each block, the block's own views that show many of them.
+    """Return a mask ``[n]`` of Gaussians at seams and, for each block, its own views that show many of these Gaussians.
 
     A Gaussian is at a seam if views of other blocks show it, too.
     """

@@ -26,7 +26,7 @@ from gsmerge.measure.fog import FOG_CAMERAS
 from gsmerge.types import Cameras
 
 PATH = re.compile(r"(?:orbit(?::(?P<turn>[^,]*))?|spline)(?:,back:(?P<back>[^,]*))?")
-CURVE_PIECES = 64  # straight pieces of a curve between two cameras, along which its length is measured
+CURVE_PIECES = 64  # straight pieces of a curve between two cameras, which add up to its length
 ORBIT_PIECES = 6 * CURVE_PIECES  # straight pieces of a whole orbit
 # Least and largest extent of an orbit, to each side and upwards, as shares of the distance to its centre. With the
 # least extent, a scene of a single photo shows few of its gaps. The largest extent turns the view by 14 degrees to each

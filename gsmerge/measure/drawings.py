@@ -69,7 +69,7 @@ class DrawOptions:
     hints: ReadHints = NO_HINTS
     views: int | str | None = None  # largest number of views, or the name of one view; None: all, but four in a panel
     path: str | None = None  # text of gsmerge.measure.camera_path.parse_camera_path, or a file of cameras
-    frames: int | None = None  # frames of a path; None: SECONDS long, of a spline at least VIEW_FRAMES for each view
+    frames: int | None = None  # frames of a path; None: enough for SECONDS; for a spline also VIEW_FRAMES per view
     size: tuple[int, int] | None = None  # width and height of a picture; None: the size of the cameras
     background: float = 0.0  # grey level in [0, 1]
 
@@ -97,8 +97,8 @@ class Drawing:
 
     paths: list[Path]  # files of the pictures, or of the video
     facts: dict[str, Any]  # facts for the report
-    draw: Callable[[int], Iterator[BytePicture]]  # number of threads -> pictures; as many views are in memory
-    mode: int = 0o666  # most rights of new files, which are those of the photos that are drawn
+    draw: Callable[[int], Iterator[BytePicture]]  # number of threads -> pictures; each thread has one view in memory
+    mode: int = 0o666  # access rights of new files: at most those of the photos that are drawn
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +108,7 @@ class DrawnScenes:
     scenes: list[tuple[Path, Gaussians]]
     sizes: list[int]  # bytes of their files
     notes: list[str]
-    load: Loaded  # the scene with this frame and these views
+    load: Loaded  # the scene whose frame and views are used
 
     def counts(self) -> dict[str, int]:
         """Return the number of Gaussians of every scene by its path."""
@@ -255,7 +255,7 @@ def _make_path(options: DrawOptions) -> tuple[DrawnScenes, Cameras, float, list[
     file = None if path else Path(options.path)
     framing = options.framing
     has_own = framing.cameras is not None or framing.images is not None or read_sharp_camera(framing.ply) is not None
-    is_scene_file = file is not None and not has_own  # the scene has no other cameras than those of the path's file
+    is_scene_file = file is not None and not has_own  # the only cameras of the scene are in the path's file
     if is_scene_file:
         options = replace(options, framing=replace(options.framing, cameras=file))
     group = _read_scenes(options, photos=False)

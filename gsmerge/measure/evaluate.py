@@ -62,7 +62,7 @@ class ViewScore:
     visible: float  # share of the pixels that the input views have seen
     full: Quality  # over all pixels
     masked: Quality  # over the pixels that the input views have seen (supplement A)
-    # Share of the pixels that the input covers, because these have a Gaussian of their own, or an opacity above a half.
+    # Share of the pixels that the input covers, by a Gaussian that comes from the pixel, or by an opacity above a half.
     # None if the input was not measured
     covered_share: float | None = None
     covered: Quality = Quality()  # PSNR and SSIM over these pixels
@@ -74,7 +74,7 @@ class ResultScores:
 
     name: str  # as the caller gave it
     num_gaussians: int
-    ratio: float  # number of Gaussians, divided by that of the input
+    ratio: float  # number of Gaussians, divided by the input's number
     render_seconds: float  # median wall time of one view with all threads
     scores: tuple[ViewScore, ...]  # one for each view
     fog: Mapping[str, Fog] = field(default_factory=dict)  # by kind of camera; empty for the input, or if not measured
@@ -159,7 +159,7 @@ class _Split:
 
     views: Views
     visible: NDArray[np.bool_]  # [v,h,w] pixels that the input views have seen
-    covered: NDArray[np.bool_] | None  # [v,h,w] pixels that the input covers; None: where renders of it are opaque
+    covered: NDArray[np.bool_] | None  # [v,h,w] pixels that the input covers; None: where the input is opaque
     reference: str  # words for the pictures with which results are compared, such as "photos"
     scored: Sequence[int]  # ids of the views that are scored
     drawn: Gaussians | None = None  # the input, if its renders replace photos; otherwise None
@@ -254,7 +254,7 @@ def evaluate(
             on_image(name, kind, view, image)
             progress(f"evaluate: {name}", next(numbers), num_pictures)
 
-        renderer.image(inputs[:1], scene.cameras, 0)  # loads the kernels, so that this is not part of a result's time
+        renderer.image(inputs[:1], scene.cameras, 0)  # loads the kernels, before times are measured
         split_scores = [
             _score_split(kind, split, scored, cameras if kind == "context" else {}, renderer, report_image)
             for kind, split in splits.items()

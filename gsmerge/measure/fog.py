@@ -28,7 +28,7 @@ VIEWS = 3  # evenly spread input views from which the cameras start
 # Outside cameras by kind, as pairs of a share and an angle. A camera steps back from an input view, by this share of
 # the view's median depth. Then the camera turns about the point in the view's middle, by this angle in degrees
 FOG_CAMERAS = {"back": ((0.5, 0), (1.5, 0)), "turned": ((0.5, -30), (0.5, 30))}
-ALL = "all"  # kind that stands for all of these cameras
+ALL = "all"  # kind that stands for the outside cameras of all kinds
 FOG_PIXELS = 480  # longer side of the pictures is at most this, pixels
 # A pixel of the input is empty if its opacity is below FOG_EMPTY, and solid if its opacity is above FOG_SOLID. A solid
 # pixel of the input is a hole of a result if the result has an opacity below FOG_OPEN in this pixel

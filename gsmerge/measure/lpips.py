@@ -42,7 +42,7 @@ class _Conv:
     stride: int = 1
     padding: int = 1
     pool: int = 0  # pixels per side of a max pooling with stride 2 before the convolution; 0: no pooling
-    compared: bool = True  # True: its features enter the distance
+    compared: bool = True  # True if the features of this layer enter the distance
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class _Architecture:
 
     file: str
     trunk: str  # key of the convolutions in the file
-    min_size: int  # least pixels per side of an image, with which the last layer still has one pixel
+    min_size: int  # least pixels per side of an image; the last layer then still has one pixel
     convs: tuple[_Conv, ...]
 
 

@@ -15,7 +15,7 @@ from gsmerge.runtime.memory import human_bytes, human_share
 Row = Sequence[str]
 TextTable = tuple[str, Row, Sequence[Row]]  # heading, columns, rows
 
-SPLIT_WORDS = {"context": "input", "target": "held-out"}  # what the views of a split are called
+SPLIT_WORDS = {"context": "input", "target": "held-out"}  # words for the views of a split
 SIMPLE = ("psnr", "ssim")  # measures that are also taken over the pixels that the input covers
 SCORE_COLUMNS = {"psnr": "PSNR (dB)", "ssim": "SSIM", "lpips_vgg": "LPIPS VGG", "lpips_alex": "LPIPS AlexNet"}
 METRICS = tuple(field.name for field in fields(Quality))

@@ -43,7 +43,7 @@ class Side:
     splats: bytes | None  # the Gaussians in the page's frame, see :func:`pack_splats`; None: too many for a page
     sh_degree: int  # degree of the harmonics in the page
     file_sh_degree: int  # degree of the harmonics in the file
-    covered_share: float | None  # share of the pixels of the views of ``mean`` that the input covers
+    covered_share: float | None  # share of the pixels that the input covers, in the views of ``mean``
     covered: Quality  # mean over the covered pixels of these views
     seconds: float  # time to draw a view on this machine, with all threads
     new_gain: tuple[float, float] | None = None  # bounds of the expected gain of new views, dB; None: not known

@@ -109,7 +109,7 @@ class Case:
     name: str  # name on the command line
     words: str  # description of the change
     check: Check  # name of the property that must hold, see ``PROPERTIES``
-    needs: Needs = "anything"  # of a scene: one Gaussian per pixel ("pixels"), or also photos ("photos")
+    needs: Needs = "anything"  # what a scene needs: one Gaussian per pixel ("pixels"), or also photos ("photos")
     change: Callable[[StressScene], StressScene] | None = None  # returns the changed scene; None: the scene stays
 
 
@@ -243,7 +243,7 @@ def _measure_psnr(setup: StressScene, gaussians: Gaussians) -> tuple[float, floa
 
 def _fit_slack(options: CompactOptions) -> float:
     """Return how many dB more than usual a result may lose, because of a full fit in its options."""
-    fit_slack = 1.0  # dB; after a full fit, thin structures and so the PSNR depend on rounding by up to this
+    fit_slack = 1.0  # dB; rounding may change the PSNR by this after a full fit, because thin structures depend on it
     return fit_slack if options.fit.fit == "full" else 0.0
 
 

@@ -50,7 +50,7 @@ class Tuning:
     # A Gaussian is long if three standard deviations exceed `long_share` of the width of the nearest photo. A
     # Gaussian's longest axis may be at most `max_ratio` times its second one, because longer Gaussians look like
     # strokes from other viewpoints. If the fit adds Gaussians after half of its steps, `max_ratio` only holds from then
-    # on. The few Gaussians before fit better if they may be long
+    # on. Until then there are few Gaussians, which fit better if they may be long
     long_share: float = 0.25
     max_ratio: float = 3.0
     average_share: float = 0.2  # The parameters are averaged over this share of the steps, which are the last ones
@@ -59,7 +59,7 @@ class Tuning:
     # of a run the weight is 0, because differences between pixels only help once edges are roughly in their places
     edge_weight: float = 2.4
     # Weight of the mean opacity in the loss (3DGS-MCMC, Kheradmand et al. 2024). This weight fades Gaussians that the
-    # photos do not need. In other views such Gaussians would hide surfaces
+    # photos do not need, because they would hide surfaces in other views
     opacity_reg: float = 0.03
     # Weight of the mean scale in the loss, relative to each Gaussian's size at its start. This weight lets fewer
     # Gaussians overlap, so that a step takes a third less time

@@ -126,7 +126,7 @@ class _PhotoSession:
     """A lit room with the poses of cameras, and the settings of its photos and of the simulated network."""
 
     lit: LitRoom
-    poses: list[Array]  # camera to world, in metres, along the path: views at even indices, held-out views at odd ones
+    poses: list[Array]  # camera to world, in metres, along the path: even indices: views, odd indices: held-out views
     to_export: Array  # [4,4] world of the room -> world of the exporter, without its unit
     lens: Pinhole  # camera of the views
     photo_lens: Pinhole  # camera of the photos
@@ -208,7 +208,7 @@ def _plan_session(rng: np.random.Generator, options: GenerateOptions) -> _PhotoS
 
 def _shrink_lens(lens: Pinhole) -> Pinhole:
     """Return a smaller camera for previews, which show if views are usable, and how bright views are."""
-    divisor = 8  # the sides of previews are those of views divided by this
+    divisor = 8  # the sides of a preview are the sides of a view divided by this
     return Pinhole(max(8, lens.width // divisor), max(8, lens.height // divisor), lens.focal / divisor)
 
 

@@ -64,7 +64,7 @@ class Example:
     cameras: Cameras  # cameras of these v views
     features: FeatureGaussians  # g analytic Feature Gaussians before merging
     base: Gaussians  # g Gaussians, one for each Feature Gaussian
-    photos: Photos  # p photos without colours: first those of the views, then those of novel views
+    photos: Photos  # p photos without colours: first the photos of the views, then the photos of novel views
     images: np.ndarray  # [p,h,w,3] uint8, colours of the photos, sRGB
     covers: np.ndarray  # [v,p,h,w] uint8: coverage of photos by the Gaussians of each view, see scenes.coverage
     colors: ColorMap = ColorMap()  # change of the photos' colours; ``images`` are unchanged
