@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from gsmerge.networks.weights import NetworkWeights
     from gsmerge.raster.photos import PhotoScore
 
-AUTO_STEPS = 2  # with budget auto, steps relative to the usual number: the curve may choose few Gaussians, which need more
+AUTO_STEPS = 2  # with budget auto, steps relative to the usual number: few Gaussians need more steps
 SHORT_STEPS = 60  # a fit with at most this many steps still gains from a better start
 MOST_STEPS = 2.0  # most steps for more than the usual share of Gaussians per pixel, relative to the usual steps
 USUAL_VIEWS = 12  # views up to which the steps of an effort are enough

@@ -201,8 +201,7 @@ class LargePhotos(ArrayFields):
     width: int
     height: int
     ids: tuple[int, ...]  # Number of each view's photo, for `read`
-    # Number of a photo -> [height,width,3] uint8 sRGB; several threads may call it. Each scene that is read gets a new
-    # function
+    # Number -> photo [h,w,3], uint8 sRGB; several threads may call it. Each scene that is read gets a new function
     read: Callable[[int], np.ndarray] = field(compare=False)
 
     def __getitem__(self, views: Sequence[int]) -> LargePhotos:
