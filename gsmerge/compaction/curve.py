@@ -63,8 +63,8 @@ def measure_curve(
 ) -> list[CurvePoint]:
     """Measure PSNR and SSIM, at full size, of short fits with each of the ``counts``.
 
-    Every fit takes ``steps`` steps, whatever the plan says. Each fit is scored on the photos of ``left_out`` or,
-    without them, on patches of all photos that the fit leaves out.
+    Every fit takes ``steps`` steps, also if the plan has another number. Each fit is scored on the photos of
+    ``left_out`` or, without them, on patches of all photos that the fit leaves out.
     """
     holdout = 0.1  # share of the photos' patches that the fits leave out
     short = replace(
@@ -133,7 +133,7 @@ def count_reaching(points: Sequence[tuple[int, float]], target: float) -> int:
 
 
 def curve_knee(points: Sequence[CurvePoint]) -> int:
-    """Return the count beyond which more Gaussians add little quality.
+    """Return the number beyond which further Gaussians add little quality.
 
     The knee of the curve is the last count at which the quality grows by at least 0.15 dB per doubling of the count.
     Halfway between two neighbouring points, the slope of the curve is that of the line through both points. Elsewhere

@@ -38,7 +38,7 @@ class LeftOut:
 
     @property
     def rows(self) -> Gaussians:
-        """Gaussians of the input that belong to the other views."""
+        """Gaussians of the input that come from the other views."""
         return self.rest.scene.file_gaussians
 
     def score(self, gaussians: Gaussians) -> np.ndarray:
@@ -47,12 +47,12 @@ class LeftOut:
         return np.array([score_photos(gaussians, self.photos, [i], covered=[mask]).covered_psnr for i, mask in views])
 
     def reduce(self, count: int) -> int:
-        """Return the number of Gaussians for the other views, if the whole scene has ``count``."""
+        """Return the number of Gaussians for the other views, if the whole scene has ``count`` Gaussians."""
         views = len(self.rest.scene)
         return max(1, round(count * views / (views + len(self.photos))))
 
     def plan(self, plan: Plan, **settings: Any) -> Plan:
-        """Plan a run on the views that remain with the settings of ``plan``, some of which ``settings`` replace.
+        """Plan a run on the remaining views, with the settings of ``plan``, except that ``settings`` replace some.
 
         Settings that depend on the whole scene, such as a crop, are replaced by those of ``TRIAL``.
         """
@@ -87,7 +87,7 @@ def mean_seen(scores: np.ndarray, shares: np.ndarray) -> float:
 
 
 def choose_left_out(views: Sequence[int]) -> tuple[list[int], list[int]]:
-    """Choose the views to leave out in each of two rounds, evenly spread among ``views``.
+    """For each of two rounds, choose views to leave out, evenly spread among ``views``.
 
     The chosen views belong to the first and the second round in turn, so no round leaves out two neighbours.
     """

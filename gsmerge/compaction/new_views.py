@@ -64,7 +64,7 @@ class NewViews(ExpectedScores):
 
 @dataclass(frozen=True)
 class Trial:
-    """What a trial measured: the PSNR (dB) of small left-out photos, rendered from three sets of Gaussians."""
+    """What a trial measured: the PSNR (dB) of renders of three sets of Gaussians, against small left-out photos."""
 
     own_before: float  # All Gaussians of the input, including those of the left-out views
     before: float  # The Gaussians of the other views
@@ -88,7 +88,7 @@ class Trial:
 
 
 def can_try(prepared: Prepared, count: int = 0) -> bool:
-    """Return whether a trial is possible for a scene, and can tell something about a result of ``count`` Gaussians."""
+    """Return whether a trial is possible for a scene, and allows a prediction for a result of ``count`` Gaussians."""
     pixels = prepared.scene.pixels_per_view * len(prepared.scene)
     return prepared.agreement is not None and can_leave_out(prepared) and count <= MOST_SHARE * pixels
 

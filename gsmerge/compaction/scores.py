@@ -139,7 +139,7 @@ def _measure_protected(gaussians: Gaussians, prepared: Prepared, plan: Plan) -> 
 
 @dataclass(frozen=True)
 class InputScores:
-    """Scores of an input, with which a result is compared; a score is None if it cannot be measured."""
+    """Scores of an input, for comparison with a result; a score is None if it cannot be measured."""
 
     photos: PhotoScore | None  # On the scored photos
     on_files: float | None  # PSNR (dB) on the photos as they are in their files, if the run changed some

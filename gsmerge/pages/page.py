@@ -212,7 +212,8 @@ def list_figures(data: ViewData, side_id: int) -> list[Figure]:
 
 
 def _score_figure(label: str, name: str, old: float | None, new: float | None, *, own: bool, is_result: bool) -> Figure:
-    """Make the figure of a mean score, which is ``old`` for the scene itself and ``new`` for one side of the page.
+    """Make the figure of a mean score, which is ``old`` for the scene itself and ``new`` for one side (scene or result)
+    of the page.
 
     ``label`` is shown, and ``name`` is the metric. ``own`` is True if scores are measured on the photos that the fit
     used. ``is_result`` is True if the side is not the scene itself.
@@ -228,7 +229,7 @@ def _score_figure(label: str, name: str, old: float | None, new: float | None, *
 
 
 def reference_words(data: ViewData) -> tuple[str, bool]:
-    """Return words for the pictures with which scores compare, and True if a fit may have used the same pictures."""
+    """Return words for the pictures behind the scores, and True if a fit may have used these pictures."""
     if data.held_out:
         return "held-out photos", False
     return ("its own photos", True) if data.reference == PHOTOS else (data.reference, False)

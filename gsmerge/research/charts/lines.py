@@ -58,7 +58,7 @@ class Interval:
 
 @dataclass(frozen=True)
 class Point:
-    """Values of one method at one size over all scenes."""
+    """The results of one method at one size (budget or superpixels), over all scenes."""
 
     label: str  # size
     x: float  # geometric mean of the cost over the scenes

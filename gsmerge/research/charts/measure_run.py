@@ -85,7 +85,7 @@ def read_runs(folder: Path) -> list[RunRecord]:
 def run_setting(source: ChartScene, record: RunRecord, options: CompactOptions, measured: EvaluateOptions) -> RunRecord:
     """Merge a scene, measure the result, and return the completed record.
 
-    ``record`` names the scene, the method and the settings. With the method ``INPUT`` the scene itself is measured.
+    ``record`` names the scene, the method and the settings. If the method is ``INPUT``, the scene itself is measured.
     """
     scene, held_out, notes = load_source(source)
     if record.method == INPUT:

@@ -168,7 +168,7 @@ def make_synthetic_scene(seed: int, index: int, options: GenerateOptions) -> Syn
     session = _plan_session(rng, options)
     num_places = len(session.poses)
     photo_seeds = rng.integers(0, 2**63, num_places)
-    # Half of the scenes have the first camera at the origin, as many exporters write them
+    # Half of the scenes have the first camera at the origin, as the files of many exporters do
     session = replace(session, to_export=invert_motion(session.poses[0]) if rng.random() < 0.5 else np.eye(4))
     views, targets = range(0, num_places, 2), range(1, num_places, 2)
     errors = {view: (rng.normal(0, 1, (2, 3)), int(rng.integers(2**63))) for view in views}  # deviation and seed
@@ -207,7 +207,7 @@ def _plan_session(rng: np.random.Generator, options: GenerateOptions) -> _PhotoS
 
 
 def _shrink_lens(lens: Pinhole) -> Pinhole:
-    """Return a smaller camera for previews, which show if views are usable, and how bright views are."""
+    """Return a smaller camera for previews, which show whether views are usable, and how bright they are."""
     divisor = 8  # the sides of a preview are the sides of a view divided by this
     return Pinhole(max(8, lens.width // divisor), max(8, lens.height // divisor), lens.focal / divisor)
 
@@ -245,8 +245,8 @@ def _take_photo(lit: LitRoom, pose: Array, lens: Pinhole, noise: Noise, gain: fl
 def _perturb_pose(pose: Array, noise: Noise, depth: float, deviation: Array) -> Array:
     """Add the network's error to a pose, for a median ``depth``.
 
-    ``deviation [2,3]`` has standard normal numbers for rotation and position. These numbers are multiplied by the sizes
-    of the errors, ``noise.turn`` and ``noise.shift``.
+    ``deviation [2,3]`` has standard normal numbers for rotation and position. These numbers are multiplied by
+    ``noise.turn`` and ``noise.shift``, the sizes of the errors.
     """
     rotation = np.deg2rad(noise.turn) * deviation[0] / 3**0.5
     angle = np.sqrt((rotation * rotation).sum())

@@ -1,7 +1,7 @@
 """Make training examples: the Feature Gaussians of a scene's superpixels before any network, and the photos.
 
 The networks get some of the scene's views. The photos of all other views, and held-out photos, are novel views. An
-example has fixed views, or a window gets random ones of them (:func:`draw_random_views`).
+example has fixed views, of which a window may get a random choice (:func:`draw_random_views`).
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class ColorMap:
 
 @dataclass(frozen=True, eq=False)
 class Example:
-    """A scene for training, or a subset of its views."""
+    """A scene for training, or some of its views."""
 
     name: str  # name of the scene
     unit: float  # unit of length of the scene, the median depth of the Feature Gaussians, in canonical units

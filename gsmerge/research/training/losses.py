@@ -77,8 +77,9 @@ def window_loss(
 ) -> Tensor:
     """Compute the loss of a window: the difference between its render and the photo, plus regularizers.
 
-    The render has a random background. If all levels are trained jointly, the loss is the mean over the levels. The
-    weight of the diversity loss is relative to the photometric loss, because the diversity loss has no natural scale.
+    The render has a random background. If all levels (values of K) are trained jointly, the loss is the mean over the
+    levels. The weight of the diversity loss is relative to the photometric loss, because the diversity loss has no
+    natural scale.
     """
     crop, background = window.crop, rng.random(3, dtype=np.float32)
     levels = options.levels if options.joint else (crop.k,)
@@ -201,10 +202,10 @@ GEOMETRY_WEIGHT, OPACITY_WEIGHT = 0.75, 0.25  # weights of the two terms of dive
 def diversity_loss(gaussians: Gaussians, parents: Tensor, sizes: Tensor) -> Tensor:
     """Penalise siblings that overlap too much or too little, or differ in opacity (paper supplement D), from 0 to 1.
 
-    Siblings are children of one group. ``parents [n]`` of the children are ascending. The result is a mean over pairs
-    of siblings, weighted by their volumes in units of the ``sizes [n]`` of their groups. The weights have no gradient,
-    since a gradient would make siblings small. With volumes in world units, as in the paper, the loss of a million
-    small Gaussians would be almost 0.
+    Siblings are children of the same group. ``parents [n]`` of the children are ascending. The result is a mean over
+    pairs of siblings, weighted by their volumes in units of the ``sizes [n]`` of their groups. The weights have no
+    gradient, since a gradient would make siblings small. With volumes in world units, as in the paper, the loss of a
+    million small Gaussians would be almost 0.
     """
     left, right = sibling_pairs(parents)
     if len(left) == 0:

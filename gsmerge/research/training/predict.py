@@ -276,8 +276,8 @@ class TrainingContext(NetworkContext):
     ) -> Array:
         """Make tokens.
 
-        Tokens are tensors for Gaussians, and arrays for members, since no network changes members. The arguments are
-        those of :func:`gsmerge.networks.tokens.part_tokens`.
+        Tokens of Gaussians are tensors, but tokens of members are arrays, since no network changes members. The
+        arguments are those of :func:`gsmerge.networks.tokens.part_tokens`.
         """
         if isinstance(parts, Gaussians):
             return differentiate_tokens(parts, ids, owners, group_features)
