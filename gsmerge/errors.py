@@ -46,8 +46,8 @@ class SceneError(GsmergeError):
     exit_code = 3
 
     def __init__(self, path: str | PathLike[str], problem: str, remedy: str = "") -> None:
-        # Messages of libraries may have several lines. Views without names are called "view 0", so that a message with
-        # "view NAME" has the word "view" twice
+        # Messages of libraries may have several lines. Views without names are called "view 0" and so on, so "view
+        # NAME" in a message has the word "view" twice
         problem = " ".join(problem.split()).replace("view view ", "view ")
         self.path, self.problem, self.remedy = str(path), problem, remedy
         super().__init__(f"{self.path}: {problem}" + (f"; {remedy}" if remedy else ""))
@@ -58,7 +58,7 @@ class SceneError(GsmergeError):
 
 
 class DoubtWarning(UserWarning):
-    """Warning of a doubtful result: worse than its input, below its target, or of files that do not fit each other.
+    """Warning of a doubtful result: worse than its input, below its target, or of files that do not fit together.
 
     Example:
         >>> import warnings
@@ -67,7 +67,7 @@ class DoubtWarning(UserWarning):
 
 
 class Doubt(str):
-    """A note for the user that the result may be poor or wrong; any other note is a plain text.
+    """A note for the user that the result may be poor or wrong. Other notes are plain strings.
 
     Commands show a doubt as a warning, and fail with ``--strict``; Python gives a :class:`gsmerge.DoubtWarning`.
     """

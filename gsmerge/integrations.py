@@ -42,8 +42,8 @@ def depth_anything_3(prediction: Any, *, sh_degree: int = 0) -> dict[str, Any]:
     return {
         **_convert_gaussians(gaussians, sh_degree),
         "scales": _unbatch("scales", gaussians.scales, 2),
-        # The model makes z positive, as if it were w. Quaternions with negative w are negated here, which keeps the
-        # rotations
+        # The model makes z of a quaternion positive, as if z were w. Quaternions with negative w are negated here,
+        # which keeps the rotations
         "quats": rotations * (1 - 2 * (rotations[:, :1] < 0)),
         "images": _as_floats(photos),
         "viewmats": viewmats,

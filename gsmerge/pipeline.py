@@ -43,7 +43,7 @@ def decode_pairs(prepared: Prepared, plan: Plan, count: int | None) -> Decoded:
 
 
 def decode_views(prepared: Prepared, plan: Plan, count: int | None) -> Decoded:
-    """Merge the superpixels of all views, and decode them into the Gaussians that a fit starts from.
+    """Merge the superpixels of all views, and decode them into the Gaussians with which a fit starts.
 
     If the scene has at most ``count`` Gaussians, all are returned unchanged.
     """
@@ -89,8 +89,8 @@ def prune_and_fill(fitted: Fitted, start: Decoded, prepared: Prepared, plan: Pla
     """Drop the Gaussians that no view sees, and fill gaps between the views with at most as many new Gaussians.
 
     Gaps are filled only after a long fit that was accepted, and not if parts of the scene may be empty, as after a
-    crop. If the plan has to fill the budget, or drops nothing, only as many unseen Gaussians are dropped as new ones
-    are added. Merged pairs, trials and an unchanged input are returned as they are.
+    crop. If the plan has to fill the budget, or drops nothing, only as many unseen Gaussians are dropped as new
+    Gaussians are added. Merged pairs, trials and an unchanged input are returned as they are.
     """
     scene, is_unchanged = prepared.scene, start.is_input and fitted.report is None
     is_long = plan.fit.grows and fitted.report is not None and fitted.report.accepted

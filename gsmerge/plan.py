@@ -1,7 +1,7 @@
-"""The plan of a run: the one place that reads "auto", effort, budget, recipe and checkpoint names.
+"""The plan of a run: only this module reads "auto", effort, budget, recipe and checkpoint names.
 
 Every choice is a function here. :func:`make_plan` makes all choices for a prepared scene or block.
-:func:`choose_for_scene` makes only the choices that need no computation, which estimates and scenes in blocks use. Each
+:func:`choose_for_scene` makes only the choices that need no computation, for estimates and for scenes in blocks. Each
 stage gets its own part of the plan, and no stage knows the options of another.
 """
 
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from gsmerge.networks.weights import NetworkWeights
     from gsmerge.raster.photos import PhotoScore
 
-AUTO_STEPS = 2  # steps relative to the usual, if budget auto leaves the count to the curve: few Gaussians need them
+AUTO_STEPS = 2  # with budget auto, steps relative to the usual number: few Gaussians need more steps
 SHORT_STEPS = 60  # a fit with at most this many steps still gains from a better start
 MOST_STEPS = 2.0  # most steps for more than the usual share of Gaussians per pixel, relative to the usual steps
 USUAL_VIEWS = 12  # views up to which the steps of an effort are enough
@@ -55,8 +55,8 @@ FIDELITY_LOSS = 0.3
 NO_FIT = "without cameras a draft has no fit: --effort fast has one"
 BLOCK_GAUSSIANS = 8_000_000  # Gaussians of a block's own views, if the number of blocks is automatic
 WHOLE_GAUSSIANS = 20_000_000  # Gaussians up to which a scene is compacted in one piece, unless it has many views
-BLOCK_VIEWS, WHOLE_VIEWS = 42, 168  # the same two limits as numbers of views, if blocks see little of each other
-LONE_K = 4  # K if all views have the same camera, because no other view adds Gaussians of its own to a surface
+BLOCK_VIEWS, WHOLE_VIEWS = 42, 168  # the two limits above as numbers of views, if blocks see little of each other
+LONE_K = 4  # K if all views have the same camera, because no other view adds Gaussians to a surface
 
 
 @dataclass(frozen=True)
@@ -69,9 +69,9 @@ class Effort:
     merges: bool = True  # Merge Gaussians of different views
     refines: bool = True  # With `checkpoint="auto"`, run all networks, not only the heads
     prunes: bool = True  # Without a fit, leave out Gaussians that no photo shows
-    fits_alone: bool = True  # Fit scenes without cameras, to views that are placed for it
+    fits_alone: bool = True  # Fit scenes without cameras, to views that gsmerge places
     large_photos: bool = True  # With `photo_scale="auto"`, allow photos larger than the views
-    report_views: int = REPORT_VIEWS  # Views that input and result are scored on for the report alone
+    report_views: int = REPORT_VIEWS  # Number of views for scores that only the report needs
 
 
 EFFORTS = {
@@ -101,13 +101,13 @@ class Plan:
     levels: int  # Levels of detail
     output: str  # Name of the output's file, whose format may round values; "": no file
     size: FileSize | None  # Largest size of the output's file; None: any
-    scored_views: tuple[int, ...]  # Given views that input and result are scored on
-    seed: int  # Everything random depends on it alone
+    scored_views: tuple[int, ...]  # Ids of the views in which input and result are scored
+    seed: int  # All random choices depend on this number alone
     checkpoint: Checkpoint | None  # Networks, from a file; None: closed formulas alone
     settings: dict[str, Any]  # All settings by flat name, for reports
     power: float = POWERS[0]  # Power of the masses by which pairs are merged
-    free_poses: bool = False  # The options ask for moved cameras, even where the scene does not need it
-    samples: bool = False  # A sample of the pixels is scored, because only the report needs the scores
+    free_poses: bool = False  # The options ask the fit to move cameras, even if the scene does not need it
+    samples: bool = False  # Only a sample of the pixels is scored, because only the report needs the scores
     new_views: bool = False  # Estimate the quality of new views
     is_trial: bool = False  # The result is only scored on left-out photos, so gaps need not be filled
     before: PhotoScore | None = None  # Score of the input, if the result has to keep its quality on photos
@@ -163,7 +163,7 @@ class FilledOptions:
 
     original: CompactOptions  # The options of the caller
     options: CompactOptions  # With K, and with a budget that the scene can use
-    segment: SegmentOptions  # With numbers that depend on effort and scene
+    segment: SegmentOptions  # With the numbers that depend on effort and scene filled in
     clean: CleanOptions  # Without the sky, if no photo shows where it is
 
     @property
@@ -176,8 +176,9 @@ class FilledOptions:
 def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoint | None = None) -> Plan:
     """Make all decisions about a run that the options leave open.
 
-    The networks are also loaded, because some decisions depend on them. ``checkpoint``: networks to use instead of
-    those that the options name. Raises UsageError if the scene or the networks do not allow what the options ask for.
+    The networks are also loaded, because some decisions depend on them. ``checkpoint`` has networks to use instead of
+    the networks that the options name. Raises UsageError if the scene or the networks do not allow what the options ask
+    for.
     """
     check_pictures(prepared, options)
     with stage("prepare"):
@@ -219,7 +220,7 @@ def _decide(prepared: Prepared, filled: FilledOptions, checkpoint: Checkpoint | 
     # a quality that the user asks for is measured on all pixels, and small views have too few tiles for a sample
     samples = not (keeps or target is not None) and scored_tiles(0, cameras.width, cameras.height, 2) is not None
     builds_several = keeps or target is not None or budget.max_drop is not None or budget.auto or budget.levels > 1
-    # all builds cut the views by one tree of regions
+    # all builds of a run share one tree of regions, by which they cut the views
     shares_tree = cuts_views(options, size) and not merges_pairs and (builds_several or limits.count is not None)
     return Plan(
         superpixels=SuperpixelChoices(segment, limits, start_share(fit), SharedTree() if shares_tree else None),
@@ -241,7 +242,7 @@ def _decide(prepared: Prepared, filled: FilledOptions, checkpoint: Checkpoint | 
         checkpoint=checkpoint,
         settings=replace(options, budget=original.budget).to_dict() | {"fit_steps": fit.steps},
         free_poses=options.prepare.poses == "free",
-        # Without a fit, new views look as good as own photos, so they need no estimate
+        # Without a fit, new views look as good as the views of the input, so they need no estimate
         new_views=fit.fit != "none" and options.effort != "draft" if options.new_views is None else options.new_views,
     )
 
@@ -323,7 +324,7 @@ def choose_blocks(scene: SceneSize, options: CompactOptions) -> int:
 def usual_blocks(num_gaussians: int, num_views: int) -> int:
     """Return the number of blocks that a scene has by default.
 
-    A scene of which only the views are many has at most this number.
+    If the views alone decide the number, it is an upper limit.
     """
     if num_gaussians > WHOLE_GAUSSIANS:
         return -(-num_gaussians // BLOCK_GAUSSIANS)
@@ -333,7 +334,7 @@ def usual_blocks(num_gaussians: int, num_views: int) -> int:
 def wanted_blocks(options: CompactOptions, num_gaussians: int, num_views: int = 0) -> int:
     """Return the largest number of blocks that a run may have by its options; 1 for a run in one piece.
 
-    ``num_views`` only matters if it is large.
+    A small ``num_views`` does not change the number.
     """
     blocks = options.blocks.blocks
     if blocks == "auto":
@@ -346,11 +347,11 @@ def keeps_fidelity(scene: SceneSize, options: CompactOptions) -> bool:
 
     The run searches if the options do not decide the number, and the scene has no photos or few Gaussians per pixel.
     With few Gaussians per pixel, no usual share of the Gaussians is right: a scene that is compact already needs most
-    of its Gaussians, and a scene of many small Gaussians needs only a few. Without photos the PSNR of the result
-    against the input has to be ``FIDELITY_PSNR``. With photos the result may show the photos ``FIDELITY_LOSS`` worse
-    than the input. Measurements are in docs/internals/notebook.md.
+    of its Gaussians, and a scene of many small Gaussians needs only a few. Without photos, the PSNR of the result
+    against renders of the input has to be ``FIDELITY_PSNR``. With photos, the PSNR of the result on the photos may be
+    ``FIDELITY_LOSS`` dB lower than that of the input. Measurements are in docs/internals/notebook.md.
     """
-    # with half a Gaussian per pixel or more, the usual share of them is enough to show the photos
+    # with half a Gaussian per pixel or more, the usual share of the Gaussians is enough to show the photos
     is_dense = scene.has_own_pixels or scene.num_gaussians >= 0.5 * scene.num_views * scene.pixels_per_view > 0
     may_keep = scene.rendered or options.budget.keep or not (is_dense or options.budget.auto)
     return may_keep and options.scene_decides
@@ -368,10 +369,10 @@ def check_pictures(prepared: Prepared, options: CompactOptions) -> None:
 
 
 def choose_networks(options: CompactOptions, size: SceneSize) -> str:
-    """Return the name of the checkpoint to load: that of the options or, if it is "auto", "shipped" or "none".
+    """Return the name of the checkpoint in the options or, if this name is "auto", "shipped" or "none".
 
-    The shipped networks improve the result if no fit follows, and if the views have photos or pixels. A fit gains more
-    if it takes further steps in the time of the networks (docs/internals/networks.md).
+    The shipped networks improve the result if no fit follows, and if the views have photos or pixels. With a fit,
+    further steps gain more than networks that take the same time (docs/internals/networks.md).
     """
     if options.checkpoint != "auto":
         return options.checkpoint
@@ -422,8 +423,8 @@ def check_networks(checkpoint: Checkpoint, options: CompactOptions) -> None:
 def resolve_budget(size: SceneSize, options: CompactOptions, agreement: Agreement | None) -> CompactOptions:
     """Fill in the number of Gaussians beyond which new views gain nothing, with a note.
 
-    The more the views confirm each other's depth, the larger is this number of Gaussians. The number is the budget if
-    the options say "auto", and an upper limit for a budget that is a share, a size or a device.
+    The more the views confirm each other's depth, the larger is this number of Gaussians. If the budget is "auto", it
+    becomes this number. If the budget is a share, a size or a device, this number is its upper limit.
     """
     budget = options.budget
     is_limit = budget.is_limit and options.method == OURS
@@ -439,7 +440,7 @@ def resolve_budget(size: SceneSize, options: CompactOptions, agreement: Agreemen
         reason = f"more would not show new views better, because {why}; --set fill=true takes the whole budget"
         note(f"budget {budget.budget}: {limit}; {reason}")
         is_only_count = options.changed_counts == ["budget"]
-        if is_only_count and agreement.share <= FEWEST:  # the limit is then the number without a budget
+        if is_only_count and agreement.share <= FEWEST:  # a run without a budget would have the same number
             budget = replace(budget, budget=None)
     return replace(options, budget=replace(budget, most=most))
 
@@ -474,7 +475,7 @@ def _resolve_clean(options: CleanOptions, prepared: Prepared) -> CleanOptions:
 def resolve_decode(options: CompactOptions, scene: SceneSize) -> DecodeOptions:
     """Choose K if the option is "auto": 4 if all views have the same camera and no long fit follows, otherwise 1.
 
-    A single view has too few Gaussians with K = 1, because superpixels are only 4.4 % of its pixels. With several
+    A single view has too few Gaussians with K = 1, because it has only 4.4 superpixels per 100 pixels. With several
     cameras, each surface gets Gaussians from several views.
     """
     decode = options.decode
@@ -489,7 +490,7 @@ def resolve_decode(options: CompactOptions, scene: SceneSize) -> DecodeOptions:
 
 
 def resolve_fit(options: CompactOptions) -> FitOptions:
-    """Fill in the number of steps by effort, and keep Gaussians that no photo shows in a draft without a fit."""
+    """Fill in the number of steps by effort. In a draft without a fit, keep Gaussians that no photo shows."""
     fit, effort = options.fit, EFFORTS[options.effort]
     steps = effort.steps if fit.fit_steps is None else fit.fit_steps
     prunes = fit.fit != "none" or effort.prunes
@@ -499,8 +500,8 @@ def resolve_fit(options: CompactOptions) -> FitOptions:
 def steps_for(options: CompactOptions, num_views: int, share: float = USUAL_SHARE) -> int:
     """Return the number of steps of the full fit.
 
-    The number follows from effort, number of views and ``share``, unless the options state the number. ``share``:
-    Gaussians of the result for each pixel. A step draws one view. Measurements are in docs/internals/large-scenes.md.
+    Unless the options state it, the number follows from effort, number of views and ``share``, the result's number of
+    Gaussians per pixel. A step draws one view. Measurements are in docs/internals/large-scenes.md.
     """
     if options.fit.fit_steps is not None:
         return options.fit.fit_steps
@@ -532,7 +533,7 @@ def _fit_renders(prepared: Prepared, options: CompactOptions, fit: FitOptions) -
     """Fill in the settings of a fit to renders of the input.
 
     Long thin Gaussians are allowed, because the input may have them. The fit is not scored on held-out patches.
-    Gaussians beyond all views, and those that hardly show in any view, are kept, because they belong to the scene.
+    Gaussians beyond all views, and Gaussians that hardly show in any view, are kept, because they belong to the scene.
     """
     if prepared.reference.placed and fit.fit == "none" and options.fit.fit != "none":
         note(NO_FIT)
@@ -543,8 +544,8 @@ def _fit_renders(prepared: Prepared, options: CompactOptions, fit: FitOptions) -
 def _choose_scored_views(prepared: Prepared, effort: Effort | None) -> tuple[int, ...]:
     """Choose the views that score input and result, among those whose pictures show the scene.
 
-    ``effort`` decides how many views the report needs. None: the views decide the number of Gaussians, which takes more
-    views than a report.
+    ``effort`` decides how many views the report needs. None: the scores of the views decide the number of Gaussians,
+    which takes more views than a report.
     """
     own = own_views(prepared)
     if prepared.reference.placed:

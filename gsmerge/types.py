@@ -201,7 +201,7 @@ class LargePhotos(ArrayFields):
     width: int
     height: int
     ids: tuple[int, ...]  # Number of each view's photo, for `read`
-    # Number -> [height,width,3] uint8 sRGB; several threads may call it. Each scene that is read gets a new function
+    # Number -> photo [h,w,3], uint8 sRGB; several threads may call it. Each scene that is read gets a new function
     read: Callable[[int], np.ndarray] = field(compare=False)
 
     def __getitem__(self, views: Sequence[int]) -> LargePhotos:
@@ -259,7 +259,7 @@ class Pixels(ArrayFields):
     Args:
         homes: ``[n]`` int, the pixel in which each Gaussian is most visible; -1 if no view sees the Gaussian.
         fronts: ``[v,h,w]`` int32, the front Gaussian of each pixel; -1 for none.
-        own: Each view has Gaussians of its own, one or more for a pixel, with the colours of its photo.
+        own: Each Gaussian comes from a pixel of one view, with the colours of the view's photo.
     """
 
     homes: np.ndarray
@@ -321,7 +321,7 @@ class Region(ArrayFields):
     half: np.ndarray  # [3] half of each side of a box; three times the same radius for a sphere
     axes: np.ndarray  # [3,3] rotation into the directions of the sides
     is_sphere: bool
-    rounding: float = 0.0  # Error of rounded positions in files; moved positions stay this far inside the border
+    rounding: float = 0.0  # Error of rounded positions in files; moved positions keep this distance from the border
 
 
 def number_views(count: int) -> tuple[str, ...]:
@@ -337,7 +337,7 @@ def _check_count(what: str, values: Sequence[Any], count: int) -> None:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Scene(ArrayFields):
-    """Gaussians, and the views from which they were made or that see them.
+    """Gaussians, and the views from which they were made or in which they are seen.
 
     The Gaussians are the rows of a file that are finite and not empty. If reading finds the pixel of each row, the
     scene has ``pixels``; otherwise :func:`gsmerge.facts.pixels.find_pixels` finds them later.
@@ -413,7 +413,7 @@ class Scene(ArrayFields):
 
     @property
     def has_own_pixels(self) -> bool:
-        """Return whether each view is known to have Gaussians of its own, with the colours of its photo."""
+        """Return whether each Gaussian is known to come from one view, with the colours of this view's photo."""
         return self.pixels is not None and self.pixels.own
 
     def get_pixels(self) -> Pixels:
@@ -425,7 +425,7 @@ class Scene(ArrayFields):
     def covered(self) -> np.ndarray | None:
         """Mask ``[v,h,w]`` of the pixels for which the file has a Gaussian.
 
-        None if the file has a Gaussian for every pixel, or if views have no Gaussians of their own.
+        None if the file has a Gaussian for every pixel, or if Gaussians do not come from single views.
         """
         if self.pixels is None or not self.pixels.own or (self.filled is None and self.pixels.shown.all()):
             return None
@@ -434,7 +434,7 @@ class Scene(ArrayFields):
 
     @property
     def is_shown(self) -> bool:
-        """Return whether the views have pictures, which are photos or the colours of the views' own Gaussians."""
+        """Return whether the views have pictures, which are photos or the colours of the pixels' Gaussians."""
         return self.has_own_pixels or self.images is not None
 
     @property
@@ -454,12 +454,12 @@ class Scene(ArrayFields):
 
     @property
     def num_gaussians(self) -> int:
-        """Number of Gaussians of the file; budgets and ratios refer to this number."""
+        """Number of Gaussians in the file; budgets and ratios refer to this number."""
         return len(self.gaussians) - (0 if self.filled is None else int(self.filled.sum()))
 
     @property
     def file_gaussians(self) -> Gaussians:
-        """The Gaussians of the file, without those that were added to fill holes."""
+        """The Gaussians of the file, without the Gaussians that were added to fill holes."""
         if self.filled is None:
             return self.gaussians
         count = self.num_gaussians
@@ -480,7 +480,7 @@ def make_scene(gaussians: Gaussians, cameras: Cameras) -> Scene:
 def fill_pixels(scene: SceneT, added: Gaussians, empty_pixels: np.ndarray) -> SceneT:
     """Add Gaussians to a scene that fill holes, each in an empty pixel.
 
-    ``empty_pixels [n]`` has the pixel of each, numbered over all views.
+    ``empty_pixels [n]`` has the pixel of each added Gaussian, numbered over all views.
     """
     count, old_pixels = len(scene.gaussians), scene.get_pixels()
     homes, fronts = old_pixels.homes, old_pixels.fronts.copy()
@@ -533,7 +533,7 @@ class Segmentation:
 
     groups: Groups  # Superpixels of every view
     count: int  # Largest number of Gaussians in the result
-    exact: bool  # True if exactly this number was requested
+    exact: bool  # True if exactly ``count`` Gaussians were requested
 
 
 @dataclass(frozen=True, eq=False)
@@ -548,9 +548,9 @@ class Matches:
 class FeatureGaussians:
     """g Gaussians that each represent a group of members, with facts about the group for later stages.
 
-    Columns that describe a group are sums over its members (weights, masses, extinctions), or means with these weights.
-    Feature Gaussians are merged by the same sums and means. The opacity is computed when Feature Gaussians are decoded,
-    as ``1 - exp(-gain * extinction / disc area)``, because blending conserves the integrated optical depth. In
+    Columns that describe a group are sums over its members (weights, masses, extinctions), or means weighted by one of
+    these. Feature Gaussians are merged by the same sums and means. The opacity is computed when Feature Gaussians are
+    decoded, as ``1 - exp(-gain * extinction / disc area)``, because blending conserves the integrated optical depth. In
     training, columns that networks change are tensors.
     """
 
@@ -591,10 +591,10 @@ class FeatureGaussians:
 
 @dataclass(frozen=True, eq=False)
 class Decoded:
-    """Canonical Gaussians that a fit starts from."""
+    """Canonical Gaussians with which a fit starts."""
 
     gaussians: Gaussians  # Canonical Gaussians
-    count: int  # Number to which the fit may grow
-    exact: bool  # True if the result must have exactly this number
+    count: int  # Number of Gaussians that the fit may reach by adding some
+    exact: bool  # True if the result must have exactly ``count`` Gaussians
     fixed: np.ndarray | None = None  # [n] bool, Gaussians that the fit does not change; None: none
-    is_input: bool = False  # True if these are all Gaussians of the scene, unchanged
+    is_input: bool = False  # True if the scene's Gaussians are all here, unchanged

@@ -27,8 +27,8 @@ def main(args: Sequence[str] | None = None) -> int:
         129 ended by SIGHUP, 130 interrupted, 143 ended by SIGTERM.
     """
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # gsmerge reports damaged images itself
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # its threads would spin beside those of gsmerge
-    gc_thresholds = 200_000, 10, 10  # above the 115,000 objects of imports, where each search for cycles takes 30 ms
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # threads of OpenBLAS would spin beside the threads of gsmerge
+    gc_thresholds = 200_000, 10, 10  # more than the 115,000 imported objects, where a search for cycles takes 30 ms
     gc.set_threshold(*gc_thresholds)
     _open_streams()
     try:
@@ -55,7 +55,7 @@ def _open_streams() -> None:
         try:
             os.fstat(descriptor)
         except OSError:
-            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # takes the lowest free one
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # takes the lowest free descriptor
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:  # closed by the caller
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 - open until the process ends
@@ -65,7 +65,7 @@ def _open_streams() -> None:
 
 
 def stop_at_once(*_: object) -> NoReturn:
-    """Print a line and end the process: the handler of SIGINT while there is nothing to clean up, as during imports."""
+    """Print a line and end the process. This handles SIGINT while there is nothing to clean up, as during imports."""
     with suppress(OSError):
         os.write(2, b"gsmerge: error: interrupted\n")
     os._exit(INTERRUPTED)

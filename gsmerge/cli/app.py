@@ -51,7 +51,7 @@ PLUGIN_PANEL = "Added by other packages"
 
 
 def make_app(only: str | None = None) -> typer.Typer:
-    """Make the application with all commands, or with one command alone, so that no other one is imported."""
+    """Make the application with all commands, or with one command alone, so that no other command is imported."""
     app = typer.Typer(
         name=PROGRAM, cls=Group, pretty_exceptions_enable=False,
         context_settings={"help_option_names": ["-h", "--help"]},
@@ -231,7 +231,7 @@ def run(args: Sequence[str] | None = None) -> int:
         return code
 
     def end_by_signal() -> int:
-        """Print that the run was ended, by Ctrl-C if by no other signal, and return the exit code."""
+        """Print that the run was ended by a signal, by default Ctrl-C, and return the exit code."""
         return (
             end_with(f"ended by {signals[0].name}", 128 + signals[0])
             if signals
@@ -250,13 +250,13 @@ def run(args: Sequence[str] | None = None) -> int:
         return end_by_signal() if code == INTERRUPTED else code  # Typer turns Ctrl-C into this code
     except (KeyboardInterrupt, typer.Abort) as error:
         if isinstance(error.__cause__, EOFError) and not signals:
-            # Typer takes an EOFError for the end of user input, which no command reads
+            # Typer assumes that an EOFError means the end of user input, but no command reads user input
             return end_with("unexpected error: EOFError; run again with --debug", 1)
         return end_by_signal()
     except BrokenPipeError:
         return 1
     except Exception as error:
-        if signals or isinstance(error.__cause__, KeyboardInterrupt):  # a library has made an error of the interruption
+        if signals or isinstance(error.__cause__, KeyboardInterrupt):  # a library has raised it as an error
             return end_by_signal()
         return end_with(*_explain(error))
 

@@ -27,7 +27,7 @@ JOBS = Setting("", kind=int | Literal["auto"], least=1)
 MAX_LISTED = 20  # rows of the table, failures, and doubtful results
 TABLE_HEADER = ("result", "Gaussians", "of", "kept", "new views", "own before", "own after", "seconds")
 OMITTED_FIRST = ("of", "seconds", "own before", "own after", "kept")  # columns that a narrow terminal omits, in order
-# Kinds of reasons that are listed for scenes -> word before each line, and noun with which the others are counted
+# Kind of a reason -> word that begins its line, and noun for counting the lines that are not listed
 REASONS = {
     "doubt": ("warning", "warning"), "unmet": ("missed target", "missed target"), "lacking": ("note", "note"),
     "error": ("failed", "failure"),
@@ -145,7 +145,7 @@ def _run_jobs(args: opt.Args, jobs: Sequence[Job], options: BatchOptions, totals
             if args.json:
                 print(json.dumps(record, separators=(",", ":")), file=stdout, flush=True)
             failure, num_skipped = record["error"] or "", totals.counts[SKIPPED]
-            # scenes that are skipped take no time, so they do not count
+            # skipped scenes take no time, so the time left is estimated without them
             share = 1.0 if num_ended == len(jobs) else (num_ended - num_skipped) / (len(jobs) - num_skipped)
             report = record["report"] or {"notes": record["doubts"]}  # a result that was done before has no report
             notes = [Doubt(note) if note in record["doubts"] else note for note in report["notes"]]
@@ -153,7 +153,7 @@ def _run_jobs(args: opt.Args, jobs: Sequence[Job], options: BatchOptions, totals
 
 
 def check_failures(failed: Sequence[tuple[str, str]], total: int, unit: str, *, listed: bool = False) -> None:
-    """Raise BatchError if jobs ``failed`` (name, reason), of ``total`` jobs that messages count as ``unit``.
+    """Raise BatchError if jobs ``failed`` (name, reason). ``unit`` is the word for one of the ``total`` jobs.
 
     The message has the first reason, unless all reasons have been ``listed`` already.
     """
@@ -176,7 +176,7 @@ class Totals:
     total: int  # scenes
     counts: Counter[str] = field(default_factory=Counter)  # scenes by status; "in" and "out": Gaussians
     rows: list[tuple[str, ...]] = field(default_factory=list)  # rows of the table, for the first results
-    # Kind of reason -> scenes with their reasons. Skipped results also count, with their doubts and missed targets
+    # Kind of reason -> scenes with their reasons. Doubts and missed targets of skipped results also count
     reasons: dict[str, list[tuple[str, str]]] = field(default_factory=lambda: {name: [] for name in REASONS})
 
     def add(self, record: Mapping[str, Any]) -> None:
@@ -278,7 +278,7 @@ def _print_plan(args: opt.Args, jobs: Sequence[Job], options: BatchOptions, note
 
     out, pending = args.output, pending_jobs(jobs, args.output, options)
     concurrency = choose_concurrency(jobs, options)
-    pending_scenes = {job.scene: refusal for job, refusal in pending}  # a refusal of None: would be compacted
+    pending_scenes = {job.scene: refusal for job, refusal in pending}  # None: the scene would be compacted
     num_refused = sum(refusal is not None for refusal in pending_scenes.values())
     num_pending = len(pending) - num_refused
     document = {

@@ -24,7 +24,7 @@ def lpips_networks(
 ) -> tuple[tuple[str, ...], list[str]]:
     """Return the LPIPS networks to measure with, by ``--lpips``, and a note if there is none.
 
-    By default the ``usual`` networks are measured with, as far as they are installed.
+    By default these are the ``usual`` networks that are installed.
     """
     from gsmerge.measure.lpips import INSTALL, lpips_available
 
@@ -42,10 +42,10 @@ class BeforeAfter:
     """A scene and its compact versions, as commands compare them."""
 
     load: Loaded  # the scene as it was read
-    scene: Scene  # the scene with the views to measure; if it has no views, some are placed
+    scene: Scene  # the scene with the views to measure; gsmerge places views if the scene has none
     held_out: Views | None  # views that were not part of the input
     plys: dict[str, GaussianFile]  # the compact versions by name
-    cameras: dict[str, Cameras]  # version -> cameras of the input views, if that version moved them
+    cameras: dict[str, Cameras]  # version -> cameras of the input views, if the version moved them
     notes: list[str]  # one sentence for each adaptation
 
     @property
@@ -64,14 +64,14 @@ class BeforeAfter:
 def read_before_after(args: Args, files: SceneFiles) -> BeforeAfter:
     """Read a scene, its compact versions, and the held-out views of ``--targets``.
 
-    ``files`` are those of the scene. If the scene has no views, some views are placed.
+    ``files`` are the files of the scene. If the scene has no views, some views are placed.
     """
     from gsmerge.facts.place_cameras import NO_VIEWS, PLACED_VIEWS, add_views
     from gsmerge.io import read_gaussians
     from gsmerge.io.scene_files import result_cameras
     from gsmerge.runtime.record import record_run
 
-    if files.cameras is None and "cameras" not in files.named:  # a result may have cameras that its scene lacks
+    if files.cameras is None and "cameras" not in files.named:  # a result may have cameras although its scene has none
         files = replace(files, cameras=next(filter(None, map(result_cameras, args.after)), None))
     load = args.load(files)
     views = vars(args).get("views")
@@ -92,7 +92,7 @@ def read_before_after(args: Args, files: SceneFiles) -> BeforeAfter:
 
 
 def own_cameras(paths: Sequence[Path], scene: Scene) -> tuple[dict[str, Cameras], list[str]]:
-    """Return the cameras of results whose fit moved the cameras of the scene, by name of the result, and notes.
+    """Return, by name of a result whose fit moved the cameras, its cameras; also return notes.
 
     The cameras are read from the file of the result, or from the file of cameras beside it.
     """
@@ -134,9 +134,10 @@ def require_views(load: Loaded) -> None:
 def held_out_views(
     load: Loaded, targets: Path | None, target_images: Path | None, views: int | None
 ) -> tuple[Scene, Views | None, tuple[str, ...]]:
-    """Return the scene with as many ``views`` as ``--views`` asks for, the held-out views of ``targets``, and notes.
+    """Return the scene with the number of ``views`` that ``--views`` states, the held-out views of ``targets``, and
+    notes.
 
-    With ``views``, only the held-out views between the chosen ones are returned.
+    With ``views``, only the held-out views between the chosen views are returned.
     """
     from gsmerge.photos.views import even_views, midpoint_views, subset
     from gsmerge.scene.held_out import read_held_out

@@ -59,7 +59,7 @@ def compact(args: opt.Args) -> None:
 def look(args: opt.Args) -> None:
     """Compact a scene, and open a page that compares it with the result: ``gsmerge SCENE``."""
     source, out = _find_input(args)
-    # A page cannot show joined scenes or Feature Gaussians, so it shows their result alone
+    # A page cannot show joined scenes or Feature Gaussians, so only the result is shown
     on_page = [out] if isinstance(source, FeatureFile) or len(args.scenes) > 1 else [args.scenes[0], out]
     if os.path.exists(out) and not (args.overwrite or args.dry_run):
         view_command = shlex.join(["gsmerge", "view", *map(str, on_page)])
@@ -178,7 +178,7 @@ def _view_command(scene: Path, out: Path) -> str | None:
 
     if out.suffix.lower() not in VIEWED:
         return None
-    # With ./ before it, a path that begins with a dash is not taken for an option
+    # ./ before a path that begins with a dash shows that the path is not an option
     paths = [f"./{path}" if str(path)[0] == "-" else str(path) for path in (scene, out)]
     return shlex.join(["gsmerge", "view", *paths])
 

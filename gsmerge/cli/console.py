@@ -49,7 +49,7 @@ class JsonLines:
 
     @property
     def seconds_left(self) -> float | None:
-        """Seconds until the run ends, if it goes on as fast as since the share was first known.
+        """Seconds until the run ends, if its mean speed since the share was first known stays the same.
 
         None if the share is not known, or has not grown since it was first known.
         """
@@ -168,8 +168,8 @@ def json_progress(lines: JsonLines | None = None) -> Iterator[None]:
 def _share_done(text: str, done: int, total: int) -> float | None:
     """Return the share of a run that is done when it reports progress; None if the share is not known.
 
-    The record of the run forecasts the share. Without a forecast, the share is that of the steps of the stage, if the
-    stage counts its steps.
+    The record of the run forecasts the share. Without a forecast, it is the share of the stage's steps that are done,
+    if the stage counts its steps.
     """
     from gsmerge.runtime.record import STAGES, current_record
 

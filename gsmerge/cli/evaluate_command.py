@@ -21,7 +21,7 @@ SUFFIXES = (".json", ".csv")
 
 @dataclass(frozen=True)
 class MeasuringOptions(Settings):
-    """Settings of the command besides those of :func:`gsmerge.evaluate`."""
+    """Settings of the command, in addition to the settings of :func:`gsmerge.evaluate`."""
 
     views: int | None = setting(None, "Number of input views to use as the context, at equal intervals; the "
         "held-out views midway between them are the targets.", least=1)  # fmt: skip

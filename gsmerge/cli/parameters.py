@@ -1,9 +1,9 @@
 """Declare the options of the command line, each once, and turn their values into settings.
 
 A command is a function of one :class:`Args`. The decorator :func:`command` lists the parameters of a command for Typer:
-names of options that are declared here, and declarations that only this command has. An option for a setting of the
-library has the setting's name and no default. The setting gives its help, its values and the default that the help
-shows (:func:`setting_option`).
+names of options that are declared here, and declarations of options that only one command has. An option for a setting
+of the library has the setting's name and no default. The setting gives its help, its values and the default that the
+help shows (:func:`setting_option`).
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ INPUT_GROUP, COUNT_GROUP, METHOD_GROUP, MEASURING_GROUP, OUTPUT_GROUP, GENERAL_G
 METAVARS = {bool: "", int: "NUMBER", float: "NUMBER", str: "TEXT", Path: "PATH", list[Path]: "PATH"}
 STYLES = ("bar", "json")  # of progress
 REQUIRED = Parameter.empty
-LIST_SETTINGS = "help"  # value for which --set prints all settings
-SEED_VARIABLE = "GSMERGE_SEED"  # environment variable: the seed of commands that are given none
+LIST_SETTINGS = "help"  # with this value, --set prints all settings
+SEED_VARIABLE = "GSMERGE_SEED"  # environment variable with the seed for commands without --seed
 
 SETTINGS = {
     setting.name: setting for kind in (EvaluateOptions, Engine, PlacementOptions, CompactOptions)
@@ -84,7 +84,7 @@ class Args(SimpleNamespace):
     def make(self, *kinds: type, **changes: Any) -> list[Any]:
         """Make an object of each class of settings in ``kinds``; UsageError if a value is wrong.
 
-        The values are those of :meth:`values`, replaced by ``changes``.
+        The values come from :meth:`values`, and ``changes`` replace some of them.
         """
         values = self.values(*kinds, without=changes) | changes
         settings = [{name: values[name] for name in flat_settings(kind) if name in values} for kind in kinds]
@@ -124,7 +124,7 @@ class Args(SimpleNamespace):
     def hints(self, **defaults: Any) -> ReadHints:
         """Make the hints for reading the scene; UsageError for an unknown name or value in ``--hint``.
 
-        ``defaults``: hints that apply where the user gave none.
+        ``defaults`` are hints that apply where the user gave none.
         """
         from gsmerge.scene.exporters import find_exporter
 
@@ -139,7 +139,7 @@ class Args(SimpleNamespace):
     def files(self, scene: Path, *more: Path) -> SceneFiles:
         """Find the .ply, cameras and photos of a scene, and of further scenes to join with it.
 
-        Files that the user named are used, otherwise those beside each scene.
+        Files that the user named are used, otherwise the files beside each scene.
         """
         from gsmerge.io.scene_files import find_scene_files
 
@@ -230,7 +230,7 @@ class Declaration:
     def read(self, typed: Any, flags: Collection[str]) -> Any:
         """Parse the words that the user typed for this parameter.
 
-        UsageError for a wrong word, or for one of the command's ``flags``, before which a value was forgotten.
+        UsageError for a wrong word, or for one of the command's ``flags`` in place of a value.
         """
         if not isinstance(typed, str | list | tuple):  # a switch, or a default
             return typed
@@ -252,7 +252,7 @@ def _declare(
 ) -> Declaration:
     """Declare an argument or option.
 
-    ``kind`` is the type of its value, ``list[...]`` for several values, or a union with None.
+    ``kind`` is the type of the value, ``list[...]`` for several values, or a union with None.
     """
     kind = next(part for part in get_args(kind) if part is not NoneType) if isinstance(kind, UnionType) else kind
     is_list = get_origin(kind) is list

@@ -87,7 +87,7 @@ def _check_writable(folder: Path, output: Path, expected: str) -> None:
         nearest = next(path for path in (folder, *folder.absolute().parents) if os.path.lexists(path))
     except OSError as error:
         raise SceneError(output, f"cannot be read ({error.strerror})", "name another output") from error
-    except StopIteration:  # on Windows, if there is no such drive
+    except StopIteration:  # on Windows, if the drive does not exist
         raise SceneError(output, f"found no drive {folder.absolute().drive}", "name another output") from None
     if not nearest.is_dir():
         raise SceneError(output, f"expected {expected}, found the file {nearest}", "name another output")
@@ -101,7 +101,7 @@ def input_files(files: SceneFiles) -> tuple[Path, ...]:
 
 
 def write_texts(texts: Mapping[Path, str | bytes], mode: int = 0o666) -> None:
-    """Write texts to files, all of them or none; existing files are replaced.
+    """Write texts to files, either all or none; existing files are replaced.
 
     ``mode``: permissions of new files, of which the user's mask may take some away.
     """

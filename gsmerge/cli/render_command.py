@@ -29,7 +29,7 @@ def parse_views(text: str) -> int | str:
     """Parse ``--views``: a number or the name of a view. Digits that begin with 0 are a name."""
     if not re.fullmatch(r"[+-]?[\d.]+", text) or re.fullmatch(r"0\d+", text):
         return text
-    max_digits = 9  # of a longer number only the first digits are read, which are more than enough views
+    max_digits = 9  # of a longer number only this many digits are read, which is still more than enough views
     count = int(text[:max_digits]) if text.isdecimal() else 0
     if count < 1:
         raise ValueError(f"expected a number from 1 or the name of a view, got {text}")

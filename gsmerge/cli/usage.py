@@ -16,7 +16,7 @@ from gsmerge.settings.setting import flat_settings
 PROGRAM = "gsmerge"
 LAB = "lab"  # group of research commands
 LOOK = "look"  # compact with a page; runs if the first word is a scene instead of a command
-# Names that other programs give to options, and the names of these options here, which do not resemble them
+# Names that other programs give to options, and the different names of the same options here
 SYNONYMS = {
     **dict.fromkeys(("force", "clobber", "yes"), "overwrite"),
     **dict.fromkeys(("ratio", "percent", "keep", "count", "num-gaussians"), "budget"),
@@ -29,7 +29,7 @@ UsageErrors: Any = typer.BadParameter.__mro__[2]
 
 
 class _Words:
-    """Replacement of Typer's conversion, which leaves the words of a parameter as they were typed.
+    """Replaces Typer's conversion, and leaves the words of a parameter as they were typed.
 
     Commands convert the words themselves, by the declarations of the settings. Typer's conversion imports Pydantic,
     which takes 50 ms of each run.
@@ -70,7 +70,7 @@ class _OneLine:
 
 
 class Group(_OneLine, TyperGroup):
-    """A command with commands of its own."""
+    """A command with subcommands."""
 
 
 class Command(_OneLine, TyperCommand):

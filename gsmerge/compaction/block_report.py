@@ -26,16 +26,16 @@ def join_reports(
     psnrs: Sequence[float | None],
     options: CompactOptions,
 ) -> CompactReport:
-    """Make the report of the whole scene, whose PSNR is the mean of the blocks' PSNR, weighted by their views.
+    """Make the report of the whole scene. Its PSNR is the mean of the blocks' PSNR, weighted by their numbers of views.
 
-    ``psnrs`` has the PSNR (dB) of the result on the photos of each block, or None without photos. Seconds and notes are
-    those of the current record. If the result may be worse than the input, result and input are scored again on all
+    ``psnrs`` has the PSNR (dB) of the result on the photos of each block, or None without photos. Seconds and notes
+    come from the current record. If the result may be worse than the input, result and input are scored again on all
     photos.
     """
     run, num_views = current_record(), [len(start.block.own) for start in starts]
 
     def mean(values: Sequence[float | None]) -> float | None:
-        """Return the mean of a value of each block, weighted by the blocks' views; None if a block has no value."""
+        """Average a value of each block, weighted by the blocks' numbers of views; None if a block has no value."""
         numbers = [value for value in values if value is not None]
         return None if len(numbers) < len(values) else float(np.average(numbers, weights=num_views))
 

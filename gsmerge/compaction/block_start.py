@@ -27,7 +27,7 @@ class BlockStart:
     block: Block
     gaussians: Gaussians  # Canonical Gaussians that belong to the block
     count: int  # Gaussians that the block is to have in the end
-    prepared: Prepared  # Its views, without the Gaussians of their pixels
+    prepared: Prepared  # The block's views, without Gaussians
     plan: Plan
     psnr_before: float | None  # PSNR (dB) of the input on the scored photos; None without photos
 
@@ -56,7 +56,7 @@ def start_block(
 
 
 def belongs_to_block(means: np.ndarray, block: Block, covisibility: Covisibility) -> np.ndarray:
-    """Return a mask ``[n]`` of the means ``[n,3]`` whose owner is one of the block's own views.
+    """Return a mask ``[n]`` of the means ``[n,3]`` whose owner is a view that belongs to the block.
 
     The owner is searched among the views that share surfaces with the block, because other views do not see these
     means.

@@ -1,4 +1,5 @@
-"""Compact a scene of many views in blocks: each block keeps its own Gaussians, and those of all blocks are joined."""
+"""Compact a scene of many views in blocks: each block keeps the Gaussians that belong to it, and the kept Gaussians of
+all blocks are joined."""
 
 from __future__ import annotations
 
@@ -51,16 +52,17 @@ from gsmerge.types import Cameras, Decoded, Gaussians, Scene
 
 T = TypeVar("T")
 # A block may have more superpixels than its views would have in one piece, if views of other blocks also see the
-# block's surfaces (see count_factors). The block has at most MOST_DENSITY times as many superpixels as in one piece
+# block's surfaces (see count_factors). The block has at most MOST_DENSITY times as many superpixels as its views would
+# have in one piece
 MOST_DENSITY = 2.0
 BLOCK_SURPLUS = 1.03  # Gaussians of all blocks, relative to the requested number; the faintest are dropped at the end
 
 
 def cut_views(scene: Scene, options: CompactOptions, count: int) -> tuple[list[Block], Covisibility]:
-    """Cut the views of a scene into ``count`` blocks; also return what each view sees of the others.
+    """Cut the views of a scene into ``count`` blocks; also return how much each view sees of every other view.
 
-    If the user asks for blocks, or the memory is too small for one piece, there are ``count`` blocks. If only the views
-    are many, there may be fewer blocks, down to one.
+    If the user asks for blocks, or the memory is too small for one piece, there are ``count`` blocks. If the only
+    reason is the number of views, there may be fewer blocks, down to one.
     """
     with stage("partition"):
         covisibility = measure_covisibility(scene.numpy())
@@ -75,9 +77,9 @@ def compact_in_blocks(
     """Compact a scene in blocks of views.
 
     First the views of each block are merged, and each block keeps the Gaussians that belong to it. The sets of all
-    blocks are joined into one set of Gaussians. Each block fits the Gaussians that its views see, including Gaussians
-    of its neighbours, and keeps its own Gaussians. At the border of two blocks, both fit the same Gaussians to the same
-    photos.
+    blocks are joined into one set of Gaussians. Each block fits all Gaussians that its views see, also Gaussians of its
+    neighbours, and keeps the Gaussians that belong to it. At the border of two blocks, both fit the same Gaussians to
+    the same photos.
     """
     device, scene = scene.gaussians.device, scene.numpy()
     count, limit = len(blocks), choices.limits.count
@@ -106,7 +108,8 @@ def compact_in_blocks(
             joined, owners = join_parts([start.gaussians for start in starts])
             growth = sum(start.count for start in starts) / max(1, len(joined))
             if limit is not None and options.budget.is_filled:
-                # Blocks drop new Gaussians that belong to other blocks, so all need a surplus to reach the number
+                # Blocks drop new Gaussians that belong to other blocks, so each block needs a surplus to reach its
+                # number
                 growth = max(growth, BLOCK_SURPLUS * limit / max(1, len(joined)))
         shared_start = work.share((joined, owners))
         fitted = list(adopt_records(work.run("fit", fit_block, count, list_calls(starts, shared_start, growth))))
@@ -149,9 +152,9 @@ def block_parts(scene: Scene, options: CompactOptions, choices: SceneChoices, co
 
 
 def adopt_records(outcomes: Iterable[tuple[T, Record]]) -> Iterator[tuple[T, dict[str, Any]]]:
-    """Yield what each block returned, with the choices of the block's record.
+    """Yield, for each block, what the block returned, and the choices in its record.
 
-    Seconds, notes and left-out photos of that record are added to the current record.
+    Seconds, notes and left-out photos in the block's record are added to the current record.
     """
     for value, record in outcomes:
         add_seconds(record.seconds)
@@ -248,15 +251,15 @@ def with_choices(options: CompactOptions, choices: SceneChoices) -> CompactOptio
 def block_options(
     options: CompactOptions, scene: Scene, block: Block, factor: float, limit: int | None
 ) -> CompactOptions:
-    """Return the options of a block: those of the scene, but with the block's part of Gaussians and fit steps.
+    """Return the options of a block: the scene's options, but with only a part of the Gaussians and fit steps.
 
-    The part is the block's share of the views. The block's number of Gaussians is also multiplied by ``factor``.
-    Cameras and exposures stay fixed. ``limit`` is the number of Gaussians of all blocks together; None: ``superpixels``
-    and K decide.
+    This part is the block's share of the scene's views. The block's number of Gaussians is also multiplied by
+    ``factor``. Cameras and exposures stay fixed. ``limit`` is the number of Gaussians of all blocks together; None:
+    ``superpixels`` and K decide.
     """
     settings: dict[str, Any] = {**ONE_PIECE, "budget": None}
     settings["fit_steps"] = max(1, round(options.fit.steps * len(block.views) / len(scene)))
-    # with few steps, the share of steps that draw a quarter of the pixels would differ from that in the whole scene
+    # with few steps, the share of steps that draw a quarter of the pixels would differ from the whole scene's share
     if replace(options.fit, fit_steps=settings["fit_steps"]).half_res_part != options.fit.half_res_part:
         settings["half_res_share"] = options.fit.half_res_part
     superpixels = options.segment.superpixels

@@ -25,7 +25,7 @@ class Candidate:
     cameras: Cameras  # The given views in the world; their poses are those of the fit
     psnr: float | None  # Mean PSNR (dB) of the scored views, against photos or renders of the input; None without views
     record: Record  # Seconds, choices and notes of building and scoring it
-    # PSNR (dB) that a search compares with its target. Only pixels that the input covers count, if it leaves gaps
+    # PSNR (dB) that a search compares with its target. If the input leaves gaps, only the pixels that it covers count
     deciding_psnr: float | None = None
 
 
@@ -40,7 +40,7 @@ def make_candidate(count: int | None, fitted: Fitted, prepared: Prepared, plan: 
 
 
 def rescore(candidate: Candidate, gaussians: Gaussians, prepared: Prepared, plan: Plan) -> Candidate:
-    """Return a candidate that has only ``gaussians``, which are all or some of its own, with their PSNR."""
+    """Return the candidate with only ``gaussians``, which are some or all of its Gaussians, and with their PSNR."""
     with record_part(silent=True) as record:
         psnr, _ = _measure_candidate(gaussians, with_moved_views(prepared, candidate.fitted.cameras), plan)
     choices = candidate.record.choices | record.choices
@@ -48,7 +48,7 @@ def rescore(candidate: Candidate, gaussians: Gaussians, prepared: Prepared, plan
 
 
 def _measure_candidate(gaussians: Gaussians, moved: Prepared, plan: Plan) -> tuple[float | None, float | None]:
-    """Return ``psnr`` and ``deciding_psnr`` of a candidate with these Gaussians of the world.
+    """Return ``psnr`` and ``deciding_psnr`` of a candidate with ``gaussians``, which are in the world frame.
 
     Both PSNR are measured against photos, or against renders of the input if the renders stand for photos. Both PSNR
     are None without photos and renders. ``moved`` is the scene with the cameras of the fit.
@@ -80,8 +80,8 @@ def _measure_fidelity(gaussians: Gaussians, prepared: Prepared, plan: Plan) -> f
 def with_moved_views(prepared: Prepared, cameras: Cameras) -> Prepared:
     """Return a prepared scene whose views have the canonical ``cameras`` of a fit.
 
-    The views of the input, which are in the world, move along. If the fit moved no camera, the input's cameras stay the
-    same object.
+    The views of the input, which are in the world frame, move in the same way. If the fit moved no camera, the input's
+    cameras stay the same object.
     """
     prepared = prepared.with_cameras(cameras)
     input_cameras = prepared.final_cameras()

@@ -1,6 +1,7 @@
 """Compact a scene in memory: in one piece, or in blocks of views.
 
-In one piece, a result is built once if its number of Gaussians is known, or several times until a quality is met.
+In one piece, a result is built once if its number of Gaussians is known, otherwise several times until a quality is
+met.
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ from gsmerge.types import Gaussians, Scene, StrPath
 from gsmerge.values.arguments import check_arguments
 
 # If a result is clearly worse than its input, the scene is compacted again with these changes of the options, one after
-# another, until a result is not clearly worse. A note has the words
+# another, until a result is not clearly worse. A note in the report quotes the words
 SIMPLER: Sequence[tuple[str, Callable[[CompactOptions], CompactOptions]]] = (
     ("with the scene's own colours in place of the photos", lambda o: o.with_settings({"look": "scene"})),
     ("without a fit", lambda o: o.with_settings({"fit": "none"})),
@@ -153,8 +154,8 @@ def _compact_once(scene: Scene, options: CompactOptions) -> CompactResult:
 def compact_in_one_piece(prepared: Prepared, method: Method, options: CompactOptions) -> CompactResult:
     """Compact a prepared scene with a method, in one piece.
 
-    A search finds the number of Gaussians, unless the options state it, and builds the result. After the result its
-    coarser levels are built, a trial measures what new views gain, and the input is scored for the report.
+    A search finds the number of Gaussians, unless the options state it, and builds the result. Then coarser levels are
+    built, a trial measures what new views gain, and the input is scored for the report.
     """
     plan = add_target(make_plan(prepared, options), prepared)  # from here on, the plan replaces the options
     costs = measure_costs(prepared, plan)
@@ -176,7 +177,7 @@ def compact_in_one_piece(prepared: Prepared, method: Method, options: CompactOpt
 def run_search(search: CountSearch, build: Build, prepared: Prepared) -> Candidate:
     """Run a search for the number of Gaussians; return the best candidate, built from all views and cleaned up."""
     plan = search.plan
-    if search.left_out is not None:  # its candidates lack views, so the best count is built again
+    if search.left_out is not None:  # candidates lack the left-out views, so the best count is built again
         search.run(partial(build_left_out, build, search.left_out, search.left_out.plan(plan)))
         return build_again(build, prepared, plan, search.count)
     if plan.keeps_fidelity and plan.clean.asked:  # what clean-up leaves out would count as errors in the search
@@ -187,7 +188,7 @@ def run_search(search: CountSearch, build: Build, prepared: Prepared) -> Candida
 
 
 def find_count(scene: Scene, options: CompactOptions) -> int:
-    """Return the number of Gaussians that a run gives a scene without cameras, if a PSNR decides it.
+    """Return the number of Gaussians that a run would give a scene without cameras, if a PSNR decides this number.
 
     Estimates find the number by the same search as runs.
     """
@@ -207,7 +208,7 @@ def build_candidate(build: Build, prepared: Prepared, plan: Plan, count: int | N
 
 
 def build_again(build: Build, prepared: Prepared, plan: Plan, count: int | None) -> Candidate:
-    """Build a candidate after the search, and add its seconds to those of the run."""
+    """Build a candidate after the search, and add its seconds to the seconds of the run."""
     candidate = build_candidate(build, prepared, plan, count)
     add_seconds(candidate.record.seconds)
     return candidate
@@ -215,7 +216,7 @@ def build_again(build: Build, prepared: Prepared, plan: Plan, count: int | None)
 
 @record_part()
 def clean_best(candidate: Candidate, prepared: Prepared, plan: Plan) -> Candidate:
-    """Clean up the best candidate of a search, which built without clean-up, and score it again."""
+    """Clean up and score again the best candidate of a search that skipped clean-up."""
     adopt(candidate.record)
     gaussians, dropped = _clean_fitted(candidate.fitted, prepared, plan)
     _record_dropped(dropped, len(gaussians), None, prepared)
@@ -223,10 +224,10 @@ def clean_best(candidate: Candidate, prepared: Prepared, plan: Plan) -> Candidat
 
 
 def build_cleaned(build: Build, prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
-    """Build Gaussians and clean them up, so that ``count`` remain if the scene has that many.
+    """Build Gaussians and clean them up, so that ``count`` Gaussians remain if the scene has so many.
 
-    A few more than ``count`` are built. If too few Gaussians remain after clean-up, all are built once more, with as
-    large a surplus as clean-up dropped. If too many Gaussians remain, the faintest are dropped.
+    A few more than ``count`` are built. If too few Gaussians remain after clean-up, all are built once more, with a
+    surplus as large as the number that clean-up dropped. If too many Gaussians remain, the faintest are dropped.
     """
     if not plan.clean.asked:
         return build(prepared, plan, count)
@@ -258,8 +259,8 @@ def _clean_fitted(fitted: Fitted, prepared: Prepared, plan: Plan) -> tuple[Gauss
     """Clean up fitted Gaussians; return the remaining Gaussians, and the number of dropped Gaussians by reason."""
     from gsmerge.stages.clean import clean
 
-    # Cameras that were placed for scores are too few to show all of the scene. Without cameras, `clean` places cameras
-    # of its own
+    # Cameras that were placed for scores are too few to show all of the scene. If `clean` gets no cameras, it places
+    # enough to show the whole scene
     cameras = None if prepared.reference.placed else fitted.cameras[sorted({*prepared.repeated})]
     rows, dropped = clean(fitted.gaussians, plan.clean, cameras, prepared.scene.images, prepared.frame.leave)
     return fitted.gaussians[rows], dropped

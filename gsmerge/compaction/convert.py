@@ -149,7 +149,7 @@ def conversion_line(document: dict[str, Any]) -> str:
 
 
 def _unseen_notes(options: ConvertOptions, unseen: int, count: int, cameras: StrPath | None) -> list[str]:
-    """Return a note about ``--drop unseen`` if no cameras are known, or if ``unseen`` are most of ``count``."""
+    """Return a note about ``--drop unseen`` if no cameras are known, or if ``unseen`` exceeds half of ``count``."""
     if cameras is None:
         likely = None if options.cameras == NONE else find_scene_files(options.inputs[0]).cameras
         remedy = "" if options.cameras == NONE else f"; name them with --cameras {likely or 'FILE'}"

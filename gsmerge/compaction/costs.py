@@ -1,7 +1,7 @@
 """Estimate the processor seconds of a run and of its parts.
 
 ``inspect`` and ``--dry-run`` show the sum as the time of a run. The progress of a run follows the ratios of its parts.
-The costs below are means of whole runs with any settings. Estimates are right within a factor of about two.
+The costs below are means over whole runs with various settings. Estimates are right within a factor of about two.
 """
 
 from __future__ import annotations
@@ -24,20 +24,21 @@ from gsmerge.settings.compact import OURS
 from gsmerge.types import Scene
 
 IMPORT_SECONDS = 1.0  # imports, and the constant part of every run
-# Seconds for each million pixels of all views together, or for each million Gaussians if there are more of these:
+# Seconds for each million pixels of all views together, or for each million Gaussians if there are more Gaussians than
+# pixels:
 COST_BUILD = 1.0  # superpixels, merging and scores of a result
 COST_INPUT = 0.3  # reading and scoring the input
 COST_NETWORKS = 1.4  # the shipped networks
 COST_PAPER = 4.5  # the paper's networks, which have more inputs and refine
 COST_PAIRS = 3.0  # merging neighbours pair by pair
-COST_PLACED = 6.0  # drawing a scene without views from placed ones
+COST_PLACED = 6.0  # drawing a scene without views from placed views
 COST_SLOW = {"greedy": 25.0, "splat-transform": 60.0}  # in addition, for slow methods
 # Seconds for each step of the fit:
 COST_STEP = 0.1  # per million pixels of its view
 COST_DRAWN = 0.25  # per million Gaussians that it draws
 THREAD_GAIN = 0.35  # speed of each thread after the first, relative to the first
 TRIAL_SHARE = 0.25  # cost of the trial that estimates new views, as a share of building the result
-# Number of candidates that a search usually builds, if photos score them, and if renders of the input do
+# Number of candidates that a search usually builds: first, if photos score them; second, if renders of the input do
 USUAL_BUILDS, USUAL_BUILDS_OF_RENDERS = 3, 1
 INSIDE_GAUSSIANS = 10_000  # sample of Gaussians for the mean share that lies inside a view
 PLACED_PIXELS = 1 << 18  # largest number of pixels of a placed view
@@ -45,7 +46,7 @@ PLACED_PIXELS = 1 << 18  # largest number of pixels of a placed view
 
 @dataclass(frozen=True)
 class CountChoice:
-    """How a run chooses the number of Gaussians; by default, the options state the number."""
+    """How a run chooses the number of Gaussians. If no field is set, the options state the number."""
 
     has_target: bool = False  # Several candidates are built until one reaches a PSNR
     has_curve: bool = False  # The scene's curve decides, unless ``has_target`` or ``rendered``
@@ -58,7 +59,7 @@ class RunCosts:
     """Facts about a run that decide how many seconds its parts take."""
 
     settings: Mapping[str, Any]  # All settings by flat name, with the networks in use
-    num_pixels: int  # Of all views together, or the number of Gaussians if that is larger
+    num_pixels: int  # Pixels of all views together, or the number of Gaussians if it is larger
     view_pixels: float  # Pixels of one view
     inside: float  # Share of the result's Gaussians that a view draws
     steps: int  # Steps of a fit; 0 without a fit
@@ -70,8 +71,8 @@ class RunCosts:
     def all_parts(self, limits: CountLimits, count: int) -> list[RunPart]:
         """Return the parts that a run for about ``count`` Gaussians is expected to have, in their order.
 
-        First come the fits of a curve, if there is one. After the curve comes the build of the result, or the builds of
-        all candidates of a search. The parts of :meth:`end_parts` follow.
+        First come the fits of a curve, if a curve is measured, then the build of the result, or the builds of all
+        candidates of a search. The parts of :meth:`end_parts` follow.
         """
         choice = self.choice
         builds_of_search = USUAL_BUILDS_OF_RENDERS if choice.rendered else USUAL_BUILDS
@@ -111,7 +112,7 @@ class RunCosts:
 
 
 def mean_inside(scene: Scene) -> float:
-    """Return the share of a scene's Gaussians that lies in a view, as the mean of all views; 1 without views.
+    """Return the mean over all views of the share of the scene's Gaussians that lies in the view; 1 without views.
 
     The share is measured on a sample of the Gaussians.
     """

@@ -49,8 +49,8 @@ class CurvePoint:
 def curve_counts(max_drop: float | None, usual: int, least: int, most: int) -> tuple[list[int], int]:
     """Return the counts at which a curve is measured, ascending, and the steps of its short fits.
 
-    The counts lie around the ``usual`` one, between ``least`` and ``most``. ``max_drop`` is the largest loss of quality
-    (dB) by which the curve decides the number; None: the knee decides the number.
+    The counts lie around the ``usual`` count, between ``least`` and ``most``. ``max_drop`` is the largest loss of
+    quality (dB) that is allowed on the curve; None: the knee of the curve decides the number.
     """
     shares, steps = [1 / 8, 1 / 4, 1 / 2, 1.0], 60  # shares of the usual count; this is enough to find the knee
     if max_drop is not None:
@@ -63,8 +63,8 @@ def measure_curve(
 ) -> list[CurvePoint]:
     """Measure PSNR and SSIM, at full size, of short fits with each of the ``counts``.
 
-    Every fit takes ``steps`` steps, whatever the plan says. Each fit is scored on the photos of ``left_out`` or,
-    without them, on patches of all photos that the fit leaves out.
+    Every fit takes ``steps`` steps, also if the plan has another number. Each fit is scored on the photos of
+    ``left_out`` or, without them, on patches of all photos that the fit leaves out.
     """
     holdout = 0.1  # share of the photos' patches that the fits leave out
     short = replace(
@@ -133,11 +133,11 @@ def count_reaching(points: Sequence[tuple[int, float]], target: float) -> int:
 
 
 def curve_knee(points: Sequence[CurvePoint]) -> int:
-    """Return the count beyond which more Gaussians add little quality.
+    """Return the number beyond which further Gaussians add little quality.
 
     The knee of the curve is the last count at which the quality grows by at least 0.15 dB per doubling of the count.
-    Halfway between two neighbouring points, the slope of the curve is that of the line through both points. Between two
-    such halfway places the slope is interpolated. The points are sorted by count.
+    Halfway between two neighbouring points, the slope of the curve is that of the line through both points. Elsewhere
+    the slope is interpolated. The points are sorted by count.
     """
     doublings = [float(log(p.count) / log(2)) for p in points]
     pairs = list(pairwise(range(len(points))))

@@ -25,8 +25,8 @@ WRONG_DB = 20.0  # PSNR below which pictures look wrong; errors are then a tenth
 TWICE_DB = decibels(1 / 4)  # dB between two errors of which one is twice the other (root mean square)
 # Input and result are compared in small pictures: DISTANCE_PIXELS is their longer side, and a sample of
 # DISTANCE_GAUSSIANS stands for the input. The pictures are blurred by a standard deviation of DISTANCE_BLUR pixels, so
-# that noise of single Gaussians hardly counts. On fifteen captures every result differs less from its input than the
-# input from its photos, by .2 dB or more. Measuring takes .03 s
+# that noise of single Gaussians hardly counts. On fifteen captures, every result is nearer to its input than the input
+# is to the photos, by .2 dB or more. Measuring takes .03 s
 DISTANCE_GAUSSIANS, DISTANCE_PIXELS, DISTANCE_BLUR = 40_000, 80, 1.0
 MOST_PHOTOS, MOST_BETWEEN = 2, 3  # most photos that are compared, and most cameras that are placed between views
 
@@ -42,7 +42,7 @@ def is_clearly_worse(input_psnr: float | None, result_psnr: float | None) -> boo
 
 @stage("input")
 def describe_clear_loss(gaussians: Gaussians, prepared: Prepared) -> str | None:
-    """Say that a result is clearly worse than its input in pictures between the views; None if the result is not.
+    """Say that a result is clearly worse than its input in pictures between the views; None if it is not worse.
 
     ``gaussians`` are the canonical Gaussians of the result. The scene has photos.
     """

@@ -38,15 +38,16 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
     """Estimate size, time and memory of a run without running it.
 
     Returns:
-        ``num_gaussians`` is the largest number of Gaussians that the result can have or, if ``exact``, their number. If
-        ``psnr_kept`` is a number, ``num_gaussians`` is the smallest number, and the run takes more Gaussians until the
-        PSNR against the input is ``psnr_kept`` dB. If ``loss_kept`` is a number, the run takes more Gaussians until the
-        result shows the photos at most ``loss_kept`` dB worse than the input. If ``quality`` is given, the run takes
-        more or fewer Gaussians until this quality is met. ``ratio`` is ``num_gaussians`` relative to the input, and
-        ``bytes`` is the size as a ``.ply``. ``superpixels_per_view`` is None if a budget distributes superpixels among
-        the views, and 0 if neighbours are merged. ``blocks``, ``method``, ``k``, ``match``, ``checkpoint``, ``fit`` and
-        ``fit_steps`` are those of the run. ``seconds`` and ``memory_bytes`` have two digits, and are right within a
-        factor of about two. ``memory_problem`` says that this machine has too little memory, or is None.
+        ``num_gaussians`` is the largest number of Gaussians that the result can have or, if ``exact``, the number that
+        it will have. If ``psnr_kept`` is a number, ``num_gaussians`` is the smallest number, and the run takes more
+        Gaussians until the PSNR against the input is ``psnr_kept`` dB. If ``loss_kept`` is a number, the run takes more
+        Gaussians until the result shows the photos at most ``loss_kept`` dB worse than the input. If ``quality`` is
+        given, the run takes more or fewer Gaussians until this quality is met. ``ratio`` is ``num_gaussians`` relative
+        to the input, and ``bytes`` is the size as a ``.ply``. ``superpixels_per_view`` is None if a budget distributes
+        superpixels among the views, and 0 if neighbouring Gaussians are merged instead of superpixels. ``blocks``,
+        ``method``, ``k``, ``match``, ``checkpoint``, ``fit`` and ``fit_steps`` are the values that the run would use.
+        ``seconds`` and ``memory_bytes`` have two digits, and are right within a factor of about two. ``memory_problem``
+        says that this machine has too little memory, or is None.
     """
     if options.clean.crop is not None:
         scene = crop_scene(scene.numpy(), options.clean.crop)

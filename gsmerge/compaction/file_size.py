@@ -38,9 +38,9 @@ def measure_bytes(gaussians: Gaussians, file: Format, cameras: Cameras, names: S
 def meet_bytes(candidate: Candidate, build_again: BuildCandidate, prepared: Prepared, plan: Plan) -> Candidate:
     """Make the file of a candidate nearly as large as a budget in bytes allows.
 
-    The candidate is rebuilt with other counts until its file is about as large as allowed. Of the last build, the
-    faintest Gaussians are dropped until the file fits. The candidate is returned unchanged without a budget in bytes,
-    or if the format has a fixed number of bytes for each Gaussian.
+    The candidate is rebuilt with other counts until its file is about as large as allowed. The faintest Gaussians of
+    the last build are dropped until the file fits. The candidate is returned unchanged without a budget in bytes, or if
+    the format has a fixed number of bytes for each Gaussian.
     """
     if plan.size is None or not plan.size.packed:
         return candidate

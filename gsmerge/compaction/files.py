@@ -45,8 +45,8 @@ def compact_files(
 ) -> dict[str, Any]:
     """Read a scene, compact it, and write result, levels and cameras: all files or none.
 
-    ``hashed``: the report has hashes of the input files. ``seconds_before`` has the wall time of the caller's earlier
-    steps, by name. ``on_read`` is called with the scene after it was read.
+    If ``hashed``, the report has hashes of the input files. ``seconds_before`` has the wall time of the caller's
+    earlier steps, by name. ``on_read`` is called with the scene after it was read.
 
     Returns the report, see :func:`gsmerge.compaction.report.report_document`. Raises SceneError if the scene cannot be
     read or the result cannot be written, and UsageError if the scene lacks something that the settings need.
@@ -100,7 +100,7 @@ def _pad_to_full(result: CompactResult) -> CompactResult:
 
 
 def _list_first_layers(scene: Scene) -> list[int]:
-    """Return the views, but only the first of views with the same name and camera, which are layers of one view."""
+    """Return the views, but if several have the same name and camera, and so are layers of one view, only the first."""
     cameras = zip(scene.names, scene.cameras.viewmats, scene.cameras.Ks, strict=True)
     keys = [(name, viewmat.tobytes(), K.tobytes()) for name, viewmat, K in cameras]
     return [view for view, key in enumerate(keys) if key not in keys[:view]]
@@ -111,8 +111,8 @@ def read_input(
 ) -> Loaded:
     """Read a scene from its files, with notes on missing or unusual content.
 
-    ``hashed``: the files of Gaussians are also hashed. Raises SceneError if the scene cannot be read, or if one of its
-    files changes while it is read.
+    If ``hashed``, the files of Gaussians are also hashed. Raises SceneError if the scene cannot be read, or if one of
+    its files changes while it is read.
     """
     stats = read_stats(files)
     loaded = load_files(files, opacity=opacity, hints=hints)

@@ -38,7 +38,7 @@ class LeftOut:
 
     @property
     def rows(self) -> Gaussians:
-        """Gaussians of the input that belong to the other views."""
+        """Gaussians of the input that come from the other views."""
         return self.rest.scene.file_gaussians
 
     def score(self, gaussians: Gaussians) -> np.ndarray:
@@ -47,12 +47,12 @@ class LeftOut:
         return np.array([score_photos(gaussians, self.photos, [i], covered=[mask]).covered_psnr for i, mask in views])
 
     def reduce(self, count: int) -> int:
-        """Return the number of Gaussians for the other views, if the whole scene has ``count``."""
+        """Return the number of Gaussians for the other views, if the whole scene has ``count`` Gaussians."""
         views = len(self.rest.scene)
         return max(1, round(count * views / (views + len(self.photos))))
 
     def plan(self, plan: Plan, **settings: Any) -> Plan:
-        """Plan a run on the views that remain with the settings of ``plan``, some of which ``settings`` replace.
+        """Plan a run on the remaining views, with the settings of ``plan``, except that ``settings`` replace some.
 
         Settings that depend on the whole scene, such as a crop, are replaced by those of ``TRIAL``.
         """
@@ -78,7 +78,7 @@ def leave_out(scene: PicturedScene, views: Sequence[int], prepared: Prepared) ->
 
 
 def mean_seen(scores: np.ndarray, shares: np.ndarray) -> float:
-    """Return the mean of the scores ``[v]`` of left-out photos, weighted by the ``shares [v]`` that other views see.
+    """Average the scores ``[v]`` of left-out photos, weighted by the ``shares [v]`` of each that other views see.
 
     A photo does not count if other views see almost nothing of it.
     """
@@ -87,7 +87,7 @@ def mean_seen(scores: np.ndarray, shares: np.ndarray) -> float:
 
 
 def choose_left_out(views: Sequence[int]) -> tuple[list[int], list[int]]:
-    """Choose the views to leave out in each of two rounds, evenly spread among ``views``.
+    """For each of two rounds, choose views to leave out, evenly spread among ``views``.
 
     The chosen views belong to the first and the second round in turn, so no round leaves out two neighbours.
     """
@@ -97,7 +97,7 @@ def choose_left_out(views: Sequence[int]) -> tuple[list[int], list[int]]:
 
 
 def can_leave_out(prepared: Prepared) -> bool:
-    """Return whether some views can be left out: enough views have photos, and views have Gaussians of their own."""
+    """Return whether some views can be left out: enough views have photos, and each Gaussian comes from one view."""
     reference = prepared.reference
     has_photos = reference.name == PHOTOS and len(reference.score_views) >= LEAST_VIEWS
     return has_photos and prepared.scene.has_own_pixels

@@ -1,4 +1,4 @@
-"""All methods of compacting a scene behind one interface: our own, and those of other packages.
+"""All methods of compacting a scene behind one interface: gsmerge's method, and methods of other packages.
 
 A package adds a method by an entry point of the group ``gsmerge.methods`` that names a :class:`Method`.
 """
@@ -26,7 +26,7 @@ COMMON = ("method", "seed", "threads", "crop", "drop")  # settings that all meth
 
 @dataclass(frozen=True)
 class Method:
-    """A method of compacting a scene: our own, or another one, such as a baseline.
+    """A method of compacting a scene: gsmerge's method, or another, such as a baseline.
 
     Args:
         name: The name on the command line.
@@ -34,7 +34,7 @@ class Method:
             of canonical Gaussians, unless the method keeps the Gaussians of the input. The function's parts are blocks
             of :func:`gsmerge.runtime.record.stage`, which measures their time.
         needs_photos: The scene must have photos.
-        uses: Flat names of the settings that it uses, in addition to those that all methods use.
+        uses: Flat names of the settings that it uses, besides the settings that all methods use.
         check: Raises a UsageError if a program that the method runs is missing.
         prepare: A function of a scene and options that returns the prepared scene for ``run``.
     """
@@ -54,7 +54,7 @@ class Method:
 
 @dataclass(frozen=True)
 class _OwnMethod(Method):
-    """Our own method: the pipeline of :mod:`gsmerge.pipeline`, which also fits the Gaussians."""
+    """The method of gsmerge: the pipeline of :mod:`gsmerge.pipeline`, which also fits the Gaussians."""
 
     def build(self, prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
         """Build and fit ``count`` canonical Gaussians."""

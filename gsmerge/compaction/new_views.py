@@ -31,18 +31,18 @@ TRIAL_PIXELS = 120  # the longer side of the small pictures has at least this ma
 # (gsmerge.fit.schedule.MANY_STEPS), and predict less
 TRIAL_STEPS = 200
 # Most views of a round: those nearest to the left-out views. Farther views show little of what the left-out views show.
-# With more than TRIAL_VIEWS views, TRIAL_STEPS would also draw each view too seldom to tell how a run with more steps
-# ends
+# With more than TRIAL_VIEWS views, a fit of TRIAL_STEPS steps would also draw each view too seldom to predict a longer
+# fit
 TRIAL_VIEWS = 64
 # Small pictures have more detail in each pixel, so they lose more with few Gaussians. The trial therefore has more
 # Gaussians per pixel than the result. If the result has x times the usual number of Gaussians per pixel, the trial has
-# x to the power of SHARE_POWER times the usual number. On five captures at 1 % the larger number lowers the error of
-# the estimated gain from 2.3 to 1.0 dB
+# x to the power of SHARE_POWER times the usual number. On five captures, for results with 1 % of the Gaussians, this
+# lowers the error of the estimated gain from 2.3 to 1.0 dB
 USUAL_DENSITY, SHARE_POWER = parse_share(SHARE), 0.3
 # The expected gain of new views is a weighted mean of two gains: the gain of the result's own photos, as far as depth
-# is confirmed, with the weight OWN_WEIGHT, and the gain of left-out photos in the trial. The true gain lies between
-# these two gains, or at most SPREAD dB outside of them, for 80 % of the results or more, on ten captures and on five
-# others (docs/internals/notebook.md). Nothing is known about results with more than MOST_SHARE Gaussians for each pixel
+# is confirmed, with the weight OWN_WEIGHT, and the gain of left-out photos in the trial. On ten captures and on five
+# others, the true gain of at least 80 % of the results lies between these two gains, or at most SPREAD dB outside of
+# them (docs/internals/notebook.md). Nothing is known about results with more than MOST_SHARE Gaussians for each pixel
 OWN_WEIGHT, SPREAD, MOST_SHARE = 0.2, 1.25, 0.1
 
 
@@ -64,7 +64,7 @@ class NewViews(ExpectedScores):
 
 @dataclass(frozen=True)
 class Trial:
-    """What a trial measured: the PSNR (dB) of small left-out photos, rendered from three sets of Gaussians."""
+    """What a trial measured: the PSNR (dB) of renders of three sets of Gaussians, against small left-out photos."""
 
     own_before: float  # All Gaussians of the input, including those of the left-out views
     before: float  # The Gaussians of the other views
@@ -76,8 +76,8 @@ class Trial:
 
         ``own_before`` and ``own_after`` are the PSNR (dB) of the result's own photos, rendered from the input and from
         the result. ``confirmed`` is the share of the pixels whose depth other views confirm. New views gain at most
-        this share of what own photos gain. The input is assumed to show new views worse than its own views, by as much
-        as in the trial.
+        this share of the gain of the result's own photos. The input is assumed to show new views worse than its own
+        views, by the same difference as in the trial.
         """
         most_gain = confirmed * max(0.0, own_after - own_before)
         least_gain = min(self.after - self.before, most_gain)
@@ -88,7 +88,7 @@ class Trial:
 
 
 def can_try(prepared: Prepared, count: int = 0) -> bool:
-    """Return whether a trial is possible for a scene, and can tell something about a result of ``count`` Gaussians."""
+    """Return whether a trial is possible for a scene, and allows a prediction for a result of ``count`` Gaussians."""
     pixels = prepared.scene.pixels_per_view * len(prepared.scene)
     return prepared.agreement is not None and can_leave_out(prepared) and count <= MOST_SHARE * pixels
 
@@ -96,9 +96,9 @@ def can_try(prepared: Prepared, count: int = 0) -> bool:
 def try_new_views(prepared: Prepared, plan: Plan, build: Build, count: int) -> Trial | None:
     """Run the trial for a result of ``count`` Gaussians, in two rounds, and return what it measured.
 
-    None if the plan wants no trial, with too few photos, or with too many Gaussians. None also if views have no
-    Gaussians of their own, because the content of the left-out photos would remain in the Gaussians. A trial with this
-    content has an error of 2 dB instead of 1.2 dB, and takes a quarter of a run's time.
+    None if the plan wants no trial, with too few photos, or with too many Gaussians. None also unless each Gaussian
+    comes from one view, because the Gaussians would otherwise keep the content of the left-out photos. A trial in which
+    they keep it has an error of 2 dB instead of 1.2 dB, and takes a quarter of a run's time.
     """
     if not plan.new_views or not can_try(prepared, count):
         return None
@@ -122,7 +122,7 @@ def _score_round(prepared: Prepared, views: Sequence[int], plan: Plan, build: Bu
 
     ``share`` is the number of Gaussians per pixel. Returns an array ``[4,v]``, whose rows are the share of each photo
     that the other views see, and the PSNR (dB) of renders from all Gaussians, from the Gaussians of the other views,
-    and from the result. None if no other view sees what the photos show.
+    and from the result. Returns None if no other view sees what the left-out photos show.
     """
     used_views = views_around(prepared.scene.cameras, views, TRIAL_VIEWS)
     scene = prepared.scene if len(used_views) == len(prepared.scene) else subset(prepared.scene, used_views)
@@ -150,7 +150,8 @@ def views_around(cameras: Cameras, views: Sequence[int], most: int) -> list[int]
 def shrink_scene(scene: PicturedScene, step: int) -> PicturedScene:
     """Shrink the pictures by a factor ``step`` per side.
 
-    A new pixel keeps the front Gaussian of one old pixel in its middle, with scales that are ``step`` times as large.
+    A new pixel gets the front Gaussian of the old pixel in its middle. The scales of this Gaussian become ``step``
+    times as large.
     """
     cameras, shape = scene.cameras, scene.images.shape[1:3]
     height, width = (max(1, side // step) for side in shape)

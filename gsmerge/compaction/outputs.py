@@ -47,7 +47,7 @@ class Outputs:
 
 
 def name_outputs(result: Path, options: FileOptions | None = None, *, overwrite: bool = False) -> Outputs:
-    """Return the paths of the files of an output. Cameras get a file of their own if the format cannot hold them.
+    """Return the paths of the files of an output. Cameras get a separate file if the format cannot hold cameras.
 
     Raises UsageError if the name has no ending that can be written, or if the options do not fit the format.
     """
@@ -74,10 +74,10 @@ def write_outputs(outputs: Outputs, contents: Contents) -> int:
 def add_outputs(add: AddOutput, outputs: Outputs, temporary: Path, contents: Contents) -> dict[Path, list[Path]]:
     """Write the files of an output in a block of :func:`atomic_outputs`; return the temporary files of each level.
 
-    ``add`` is what the block yields, and ``temporary`` is what ``add`` has returned for the result. Viewers of some
-    formats start at the first camera in the file, or in a file of settings beside it. If the scene has no camera, one
-    is placed for these viewers. A file of settings that exists already stays unchanged, unless gsmerge wrote it and may
-    overwrite files.
+    ``add`` comes from the block, and ``temporary`` is the path that ``add`` has returned for the result. Viewers of
+    some formats start at the first camera in the file, or in a file of settings beside it. If the scene has no camera,
+    one is placed for these viewers. A file of settings that exists already stays unchanged, unless gsmerge wrote it and
+    may overwrite files.
     """
     format_, gaussians, has_views = outputs.format, contents.levels[0], len(contents.cameras) > 0
     contents = replace(contents, options=outputs.options)

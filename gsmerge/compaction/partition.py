@@ -1,7 +1,7 @@
 """Cut a scene into blocks of views that see the same surfaces; each block also gets some views of its neighbours.
 
 Views are nodes of a graph. The weight of an edge says how much two views see of each other's surfaces. Blocks grow one
-after another. A block begins at the border of the views that are left, and each step adds the view that shares most
+after another. A block begins at the border of the remaining views, and each step adds the view that shares most
 surfaces with the block.
 """
 
@@ -29,7 +29,7 @@ def gaussians_at_once(num_gaussians: int, blocks: int) -> int:
 
 @dataclass(frozen=True)
 class Block:
-    """Views that are compacted together: the block's own, and further ones shared with neighbouring blocks."""
+    """Views that are compacted together: the views that belong to the block, and views of neighbouring blocks."""
 
     own: tuple[int, ...]  # Its own views, ascending
     shared: tuple[int, ...]  # Views of other blocks that see the same surfaces, ascending
@@ -59,7 +59,7 @@ class Covisibility:
 
 
 def measure_covisibility(scene: Scene) -> Covisibility:
-    """Measure, for every two views, which share of the surfaces of one view the other one sees.
+    """Measure, for every two views, which share of the surfaces in one view the other view sees.
 
     Surfaces that are hidden in a view are not seen by it. The scene must have pixels.
     """
@@ -105,8 +105,9 @@ def mark_inside_and_seen(points: np.ndarray, cameras: Cameras, depths: np.ndarra
 def count_factors(blocks: Sequence[Block], covisibility: Covisibility) -> np.ndarray:
     """Return for each block the factor on its number of Gaussians that makes all blocks equally dense.
 
-    Some Gaussians on surfaces of a block belong to pixels of views outside it, so the block is built without them. The
-    number of Gaussians from the block's own views is then multiplied by the factor.
+    Some Gaussians on surfaces of a block belong to pixels of views outside the block, and the block is built without
+    these Gaussians. To make up for them, the number of Gaussians from the block's own views is multiplied by the
+    factor.
     """
     views = range(len(covisibility.cameras))
     owners = owning_views(covisibility.samples, covisibility, views)
@@ -123,8 +124,9 @@ def count_factors(blocks: Sequence[Block], covisibility: Covisibility) -> np.nda
 def partition_views(weights: np.ndarray, count: int) -> list[Block]:
     """Cut v views into ``count`` blocks of similar size, with weak edges between them.
 
-    ``weights [v,v]`` of the edges are symmetric and at least 0. Every view belongs to one block. A block also shares
-    the views of other blocks that have the largest weights with it, up to ``SHARED`` times the number of its own views.
+    ``weights [v,v]`` of the edges are symmetric and at least 0. Every view belongs to one block. A block also gets
+    views of other blocks, those with the largest weights to its own views, up to ``SHARED`` times the number of its own
+    views.
     """
     labels = grow_blocks(weights, count)
     blocks = []
@@ -167,7 +169,7 @@ def grow_blocks(weights: np.ndarray, count: int) -> np.ndarray:
             labels[view], is_free[view] = label, False
             block_weights += weights[view]
             block_weights[view] = -np.inf
-            # prefer views with weak edges to other free ones, so that no view remains alone
+            # prefer views with weak edges to other free views, so that no view remains alone
             free_weights -= weights[view]
             score = block_weights - 0.5 * np.where(is_free, free_weights, 0)
             view = int(score.argmax())

@@ -15,7 +15,7 @@ NUM_FULL = 15  # number of harmonics of the degrees 1 to 3
 
 
 def pad_harmonics(gaussians: Gaussians, count: int) -> Gaussians:
-    """Pad the harmonics above degree 0 with zeros, so that each Gaussian has at least ``count``."""
+    """Pad the harmonics above degree 0 with zeros, so that each Gaussian has at least ``count`` of them."""
     missing = max(0, count - gaussians.shN.shape[1])
     return replace(gaussians, shN=np.pad(gaussians.shN, ((0, 0), (0, missing), (0, 0))))
 
@@ -23,8 +23,8 @@ def pad_harmonics(gaussians: Gaussians, count: int) -> Gaussians:
 def find_placement(options: PlacementOptions, cameras: Cameras | None, marked: str | None = None) -> Similarity:
     """Return the map from the frame of the scene to the frame of the output file.
 
-    The upward axis of the scene is the mean of those of the ``cameras``. Without cameras the upward axis is ``marked``,
-    the axis that the header of the input file names, or else -y.
+    The upward axis of the scene is the mean upward axis of the ``cameras``. Without cameras it is ``marked``, the axis
+    that the header of the input file names, or else -y.
     """
     if not options.moves:
         return IDENTITY

@@ -22,8 +22,8 @@ class Covered:
     """PSNR over the pixels of the input views that the input covers, if it does not cover all.
 
     Args:
-        share: Share of the scored pixels that the input covers. An input file with rows for some pixels only covers
-            these pixels; any other input covers the pixels in which its opacity is at least a half.
+        share: Share of the scored pixels that the input covers. If the input file has rows for only some pixels, it
+            covers these pixels. Any other input covers the pixels in which its opacity is at least a half.
         before: Mean PSNR (dB) of the covered pixels, rendered from the input.
         after: Mean PSNR (dB) of the covered pixels, rendered from the result.
     """
@@ -36,7 +36,7 @@ class Covered:
 def compared_psnr(
     covered: Covered | None, before: float | None, after: float | None
 ) -> tuple[float | None, float | None]:
-    """Return the PSNR (dB) of input and result that are compared with each other.
+    """Return the PSNR (dB) of the input and of the result, for comparing the two.
 
     If the input does not cover all pixels, the PSNR is over the pixels that the input covers.
     """
@@ -88,7 +88,7 @@ class CompactReport:
             if the PSNR is not measured.
         covered: PSNR over the pixels that the input covers; None if the input covers at least 98 % of all pixels.
         is_far: The result is clearly worse than the input. Either the result's pictures differ from the photos more
-            than twice as much as the input's pictures. Or, between the views, the result's pictures differ from the
+            than twice as much as the input's pictures do. Or, between the views, the result's pictures differ from the
             input's pictures more than twice as much as the input's pictures differ from the photos.
         photo_files: PSNR on the photos as they are in their files; None if the run changed no photo.
         protected: PSNR over the pixels that ``protect`` marks, and their share of all pixels; None without such pixels.
@@ -254,7 +254,8 @@ def result_table(document: Mapping[str, Any], next_step: str | None = None, *, c
     """
     rows = result_facts(document)
     figures = text_table([row[:3] for row in rows], "  ")
-    # a line that is broken continues below its explanation, or below its first value in a narrow terminal
+    # a broken line continues in the column of its explanation or, in a narrow terminal, in the column of its first
+    # value
     indent = len(figures[0]) + 2 if (columns or 80) > 2 * len(figures[0]) + 4 else 13
     lines = [(f"{left}  {row[3]}".rstrip(), indent) for left, row in zip(figures, rows, strict=True)]
     lines += [(line, 2) for line in (*level_lines(document), *curve_lines(document))]
@@ -265,7 +266,7 @@ def result_table(document: Mapping[str, Any], next_step: str | None = None, *, c
 
 
 def _describe_fidelity_views(fidelity: Mapping[str, Any]) -> str:
-    """Return words for the views in which the PSNR against the input was measured."""
+    """Name the views in which the PSNR against the input was measured."""
     return f"from the input in {fidelity['views']} {'held-out' if fidelity['held_out'] else 'of its'} views"
 
 
@@ -309,7 +310,7 @@ def curve_lines(document: Mapping[str, Any]) -> list[str]:
 def _scores_on_files(document: Mapping[str, Any]) -> Mapping[str, float] | None:
     """Return the PSNR on the photos as they are in their files, before and after.
 
-    None if these numbers are printed the same as the PSNR on the photos that the run changed.
+    None if both numbers are printed equal to the PSNR on the changed photos.
     """
     on_files, own = document.get("psnr_photo_files"), document["psnr_input_views"]
     if on_files is None or own["after"] is None or any(f"{on_files[name]:.2f}" != f"{own[name]:.2f}" for name in own):

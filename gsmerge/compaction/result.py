@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class CompactResult:
-    """The compact Gaussians, in the scene's own world frame, and the report.
+    """The compact Gaussians, in the world frame of the scene, and the report.
 
     Args:
         gaussians: The Gaussians.
@@ -47,7 +47,7 @@ class CompactResult:
             ``poses`` of :class:`gsmerge.settings.stages.PrepareOptions`.
         coarser: Coarser levels of detail; each has a quarter of the Gaussians of the level before.
         names: Names of the views.
-        scene: The path of the scene that was given, or a weak reference to it, which does not keep it in memory.
+        scene: The path of the scene or, for a scene in memory, a weak reference, which does not keep it in memory.
 
     Example:
         >>> result = gsmerge.compact("demo", effort="draft", budget=300, levels=2)
@@ -99,7 +99,7 @@ class CompactResult:
     def show(self, scene: Scene | StrPath | None = None) -> Page:
         """Show the scene and the result as :func:`gsmerge.view` does, in a notebook at the end of a cell.
 
-        ``scene``: the input, which only has to be given if it is no longer in memory; without an input the result is
+        ``scene`` is the input, and is only needed if the input is no longer in memory. Without an input the result is
         shown alone.
         """
         from gsmerge.pages.view import view
@@ -120,7 +120,7 @@ class CompactResult:
         return replace(self, gaussians=replace(self.gaussians, means=to_float32(self.gaussians.means)), coarser=coarser)
 
     def to(self, device: torch.device | str | None) -> CompactResult:
-        """Return the same result with tensors on a device; without a device, return it unchanged."""
+        """Return the same result with tensors on a device, or unchanged if the device is None."""
         if device is None:
             return self
         coarser = tuple(level.to(device) for level in self.coarser)
@@ -222,7 +222,7 @@ def with_worse(report: CompactReport, worse: str) -> CompactReport:
 def _expect_new_views(
     report: CompactReport, prepared: Prepared, trial: Trial | None
 ) -> tuple[NewViews | None, str | None]:
-    """Return the expected PSNR of new views by a trial, and a warning if they are expected to be worse than before.
+    """Return the PSNR of new views that a trial predicts, and a warning if the result is expected to be worse there.
 
     The PSNR is None without a trial or without scores. The warning is also None if the report already says that the
     result is worse.

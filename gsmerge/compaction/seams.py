@@ -1,4 +1,4 @@
-"""Fit the seams between blocks: Gaussians that views of several blocks show are fitted again, to all these views."""
+"""Fit the seams between blocks: Gaussians in views of several blocks are fitted again, to all these views."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ from gsmerge.types import Decoded, Gaussians, PicturedScene
 
 FOREIGN_SHARE = 0.1  # a Gaussian is at a seam if other blocks' views have more than this share of its blending weights
 SEAM_VIEW_STEPS = 2  # steps for each view
-# If at least ROOM_SHARE of all Gaussians are at seams, the blocks show the same room from all sides. In this case the
-# fit of the seams takes ROOM_VIEW_STEPS steps for each view
+# If at least ROOM_SHARE of all Gaussians are at seams, the blocks show the same room from all sides, and the fit of the
+# seams takes ROOM_VIEW_STEPS steps for each view
 ROOM_SHARE, ROOM_VIEW_STEPS = 0.5, 4
-# Step sizes relative to those of other fits. The steps are smaller, because the fits of the blocks have already fitted
-# the Gaussians, only beside other neighbours
+# Step sizes in the fit of the seams, relative to the step sizes in other fits. They are smaller, because the Gaussians
+# at seams are already fitted, though beside Gaussians that are not in the result
 SEAM_RATE = 0.6
 
 
 def fit_seams(joined: Gaussians, owners: np.ndarray, starts: Sequence[BlockStart], seed: int) -> Gaussians:
     """Fit the Gaussians at seams again, to the photos of all blocks that show them; other Gaussians stay unchanged.
 
-    The fit of a block also changed the block's copies of neighbouring blocks' Gaussians, which are not in the result.
-    At the seams, a block's Gaussians therefore do not fit the Gaussians of its neighbours. ``owners [n]`` is the block
-    of each Gaussian.
+    The fit of a block also changed copies of Gaussians that belong to neighbouring blocks. These copies are not in the
+    result. At the seams, the Gaussians of neighbouring blocks therefore do not fit each other. ``owners [n]`` is the
+    block of each Gaussian.
     """
     plan = next((start.plan for start in starts if start.plan.fit.fit != "none"), None)
     if plan is None:
@@ -70,7 +70,7 @@ def fit_seams(joined: Gaussians, owners: np.ndarray, starts: Sequence[BlockStart
 def find_seams(
     joined: Gaussians, owners: np.ndarray, starts: Sequence[BlockStart]
 ) -> tuple[np.ndarray, list[list[int]]]:
-    """Return a mask ``[n]`` of Gaussians at seams and, for each block, the block's own views that show many of them.
+    """Return a mask ``[n]`` of Gaussians at seams and, for each block, its own views that show many of these Gaussians.
 
     A Gaussian is at a seam if views of other blocks show it, too.
     """
@@ -81,7 +81,7 @@ def find_seams(
         foreign[rows] += np.where(owners[rows] == block, 0, weights)
     at_seam = foreign > FOREIGN_SHARE * total
     seam_share = 0.1  # seams are fitted to a view if more than this share of its weights is on Gaussians at seams
-    # The weights are measured a second time, because those of all views would not fit into memory
+    # The weights are measured a second time, because the weights of all views would not fit into memory
     for block, view, rows, weights in _view_weights(splats, starts):
         seam_weight, view_weight = (float(values.sum(dtype=np.float64)) for values in (weights[at_seam[rows]], weights))
         if seam_weight > seam_share * view_weight:
@@ -106,9 +106,9 @@ def join_views(scene_views: Sequence[tuple[PicturedScene, list[int]]]) -> Pictur
 
 
 def _view_weights(splats: Splats, starts: Sequence[BlockStart]) -> Iterator[tuple[int, int, np.ndarray, np.ndarray]]:
-    """Yield for each view of a block's own views: the block, the view, and rows and weights ``[m]`` of Gaussians.
+    """Yield, for each view that belongs to a block: the block, the view, and rows and weights ``[m]`` of Gaussians.
 
-    The rows are those of the Gaussians that the view draws. A weight is the sum of the blending weights of a Gaussian
+    The rows name the Gaussians that the view draws. A weight is the sum of the blending weights of a Gaussian
     in the view. Views are numbered within the prepared scene of their block.
     """
     for block, start in enumerate(starts):

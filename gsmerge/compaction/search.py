@@ -31,8 +31,8 @@ NEAR_DB = 0.6
 PHOTOS_NEAR_DB = 0.2
 MAX_BUILDS = 6  # most builds of a search
 MAX_LEFT_OUT_BUILDS = 3  # most builds of a search by left-out photos, in addition to the build of the result
-# A PSNR that is more than this many dB above the target is lowered to this value, because a larger one, such as that of
-# the whole input, says little about the slope near the target
+# A PSNR that is more than this many dB above the target is lowered to this limit, because a much higher PSNR, such as
+# that of the whole input, says little about the slope near the target
 FAR_DB = 6.0
 
 T = TypeVar("T")
@@ -41,7 +41,7 @@ T = TypeVar("T")
 def build_in_turn(build: Callable[[int], T], first: T, choose_next: Callable[[list[T]], int | None]) -> list[T]:
     """Build one candidate after another, and return all of them; ``first`` is built already.
 
-    ``choose_next`` returns the next count, by all candidates so far, or None to end.
+    ``choose_next`` gets all candidates so far, and returns the next count, or None to end.
     """
     built = [first]
     while (count := choose_next(built)) is not None:
@@ -56,7 +56,7 @@ class SearchFacts:
     seconds: dict[str, float]  # Wall time by stage, of all candidates
     choices: dict[str, Any]
     notes: list[str]
-    unmet: str | None  # Why the target is not met; None if it is, or if there is none
+    unmet: str | None  # Why the target is not met; None if it is met, or without a target
 
 
 @dataclass(eq=False)
@@ -64,10 +64,10 @@ class CountSearch:
     """Search for the number of Gaussians: the search builds one count, or several until a quality is met."""
 
     plan: Plan  # Has the target and the limits
-    first: int | None  # The count to begin with; None: as many as `superpixels` and K give
+    first: int | None  # The first count to build; None: as many as `superpixels` and K give
     rendered: bool = False  # Candidates are scored on renders of the input, which more Gaussians always show better
-    left_out: LeftOut | None = None  # Candidates are fitted without these photos and scored on them; None: on all views
-    most: int | None = None  # Beyond this count, left-out photos gain nothing; None: the plan has the only limit
+    left_out: LeftOut | None = None  # Photos for scores, which fits of candidates leave out; None: all views score
+    most: int | None = None  # Count above which left-out photos gain nothing; None: only the plan has a limit
     candidates: list[Candidate] = field(default_factory=list)  # Candidates built so far
 
     def run(self, build: Callable[[int | None], Candidate]) -> None:
@@ -114,10 +114,10 @@ class CountSearch:
 
     @property
     def count(self) -> int | None:
-        """The number of Gaussians that the search has chosen: that of the best candidate.
+        """The number of Gaussians that the search has chosen, which is usually the number of the best candidate.
 
-        With left-out photos the number is the one at which these photos reach the target, which may lie between the
-        counts of two candidates.
+        With left-out photos, it is the number at which the PSNR of these photos reaches the target. This number may lie
+        between the counts of two candidates.
         """
         if self.plan.target_psnr is None or self.left_out is None:
             return self.best.count
@@ -149,7 +149,7 @@ class CountSearch:
         if target is None:
             return SearchFacts(seconds, {}, self.notes, None)
         best, met, left_out = self.best, self.is_met, 0 if self.left_out is None else len(self.left_out.photos)
-        # at a count between those of two candidates, the PSNR is expected to be that of the target
+        # if the count lies between the counts of two candidates, its PSNR is expected to be the target
         psnr = best.deciding_psnr if self.count == best.count else target
         choices: dict[str, Any] = {
             "search": {
@@ -215,8 +215,8 @@ def add_target(plan: Plan, prepared: Prepared) -> Plan:
 def search_count(prepared: Prepared, plan: Plan, build: Build) -> CountSearch:
     """Return the search for the number of Gaussians, before its first build.
 
-    Without a quality target, the search has one count. If the scene's curve decides the number, the curve is measured
-    here.
+    Without a quality target, the search builds one count only. If the scene's curve decides the number, the curve is
+    measured here.
     """
     limits, left_out = plan.limits, leave_out_for_scores(prepared, plan)
     agreement, most = prepared.agreement, limits.max_count
@@ -231,8 +231,8 @@ def search_count(prepared: Prepared, plan: Plan, build: Build) -> CountSearch:
 def leave_out_for_scores(prepared: Prepared, plan: Plan) -> LeftOut | None:
     """Leave out views, so that their photos can score candidates or a curve; None if no view is left out.
 
-    Views are left out if a quality target or the curve decides the count, because a fit shows the photos that it has
-    seen better than new ones. No view is left out without a fit, or if candidates only have to be as good as the input.
+    Views are left out if a quality target or the curve decides the count, because a fit shows new photos worse than the
+    photos that it has seen. No view is left out without a fit, or if candidates only have to be as good as the input.
     """
     has_target = plan.target_psnr is not None and not plan.keeps_fidelity
     if plan.fit.fit == "none" or not (has_target or plan.max_drop is not None or plan.auto_count):
@@ -252,10 +252,10 @@ def leave_out_for_scores(prepared: Prepared, plan: Plan) -> LeftOut | None:
 
 @record_part()
 def build_left_out(build: Build, left_out: LeftOut, plan: Plan, count: int | None) -> Candidate:
-    """Build a candidate from the views that remain, by a ``plan`` for them, and score it on the left-out photos.
+    """Build a candidate from the remaining views, by a ``plan`` for these views, and score it on the left-out photos.
 
-    ``count`` is the number of Gaussians for all views. The candidate has a part of this number, in proportion to its
-    views.
+    ``count`` is the number of Gaussians for all views. The candidate has a part of ``count``, in proportion to its
+    number of views.
     """
     assert count is not None
     begin_part()
@@ -290,9 +290,9 @@ def next_count(
 ) -> int:
     """Choose the next count to build in the search for the fewest Gaussians that reach a PSNR, within 15 %.
 
-    If a count that was built already is near enough, it is returned, and the search ends. The PSNR is assumed to rise
-    with the logarithm of the count. The next count is interpolated between the nearest counts on both sides of the
-    target, or extrapolated from one side.
+    If a count that was built already is near enough, this count is returned, and the search ends. The PSNR is assumed
+    to rise with the logarithm of the count. The next count is interpolated between the nearest counts on both sides of
+    the target, or extrapolated from one side.
 
     Args:
         psnrs: PSNR (dB) by count, of at least one count.
@@ -312,8 +312,8 @@ def next_count(
         width = float(log(above / below))  # of the interval between the two counts, on a logarithmic scale
         rise = (min(psnrs[above], target + FAR_DB) - psnrs[below]) / width
         step = (target - psnrs[below]) / rise if rise > 0 else width / 2
-        # The count is a little larger than interpolated, to reach the target, and not so near to either built count
-        # that its PSNR says nothing new
+        # The count is a little larger than interpolated, to reach the target, and far enough from both built counts to
+        # say something new
         return round(below * float(exp(min(max(step + 0.1 * width, 0.15 * width), 0.85 * width))))
     if above is None and len(psnrs) > 1:
         first, last = sorted(psnrs)[-2:]

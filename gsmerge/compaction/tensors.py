@@ -79,20 +79,20 @@ def compact_tensors(
         sh0: ``[n,1,3]`` or ``[n,3]`` harmonics of degree 0; rgb = 0.5 + 0.2821 sh0.
         colors: ``[n,3]`` sRGB in [0, 1], in place of ``sh0``.
         shN: ``[n,k-1,3]`` higher harmonics, basis-major; None: none.
-        images: ``[V,H,W,3]`` photos, sRGB in [0, 1]; None: the colours of the pixels' Gaussians stand in for them, or
-            renders of the scene with ``order="none"``.
+        images: ``[V,H,W,3]`` photos, sRGB in [0, 1]; None: the colours of the pixels' Gaussians replace the photos or,
+            with ``order="none"``, renders of the scene do.
         viewmats: ``[V,4,4]`` or ``[V,3,4]`` world to camera, OpenCV axes.
         Ks: ``[V,3,3]`` intrinsics in pixels; the top-left pixel's centre is (0.5, 0.5).
-        shape: Views, height and width; None: those of the images.
-        names: Names of the views; None: numbers.
+        shape: Views, height and width; None: as in ``images``.
+        names: Names of the views; None: the views are numbered.
         order: ``"view-major"``: one Gaussian per pixel, view after view; ``"none"``: Gaussians without pixels (trained
             scenes, voxels); Gaussians without pixels need no cameras.
         progress: See :func:`gsmerge.compact`.
         **settings: Settings of :func:`gsmerge.compact`, such as ``budget="4%"``, ``k=2``.
 
     Returns:
-        The result of :func:`gsmerge.compact`, with the precision of ``means``; of tensors on its device if ``means`` is
-        a tensor.
+        The result of :func:`gsmerge.compact`, with the precision of ``means``. If ``means`` is a tensor, the result has
+        tensors on the same device.
 
     Raises:
         SceneError: If an array has another shape or convention; the message says what to pass instead.

@@ -1,4 +1,4 @@
-"""Make cameras from those of a scene: along a path for videos, or one outside the capture.
+"""Make new cameras from the cameras of a scene: cameras along a path for videos, or one outside the capture.
 
 All cameras are in float64.
 """
@@ -26,10 +26,10 @@ from gsmerge.measure.fog import FOG_CAMERAS
 from gsmerge.types import Cameras
 
 PATH = re.compile(r"(?:orbit(?::(?P<turn>[^,]*))?|spline)(?:,back:(?P<back>[^,]*))?")
-CURVE_PIECES = 64  # straight pieces of a curve between two cameras, along which its length is measured
+CURVE_PIECES = 64  # straight pieces of a curve between two cameras, which add up to its length
 ORBIT_PIECES = 6 * CURVE_PIECES  # straight pieces of a whole orbit
-# Least and largest extent of an orbit, to each side and upwards, as shares of the distance to its centre. The least
-# extent shows few of the gaps in a scene of a single photo. The largest extent turns the view by 14 degrees to each
+# Least and largest extent of an orbit, to each side and upwards, as shares of the distance to its centre. With the
+# least extent, a scene of a single photo shows few of its gaps. The largest extent turns the view by 14 degrees to each
 # side
 HORIZONTAL, VERTICAL = (0.06, 0.25), (0.03, 0.125)
 
@@ -41,7 +41,7 @@ class CameraPath:
     Args:
         kind: "orbit" or "spline".
         turn: Degrees that an orbit turns to each side; None: chosen from the scene's cameras, see :func:`orbit`.
-        back: How far all cameras of the path step back, as a share of the depth of what they look at.
+        back: How far all cameras of the path step back, as a share of the depth of the surfaces in view.
     """
 
     kind: str
@@ -85,7 +85,7 @@ def _parse_number(text: str | None, expected: str, most: float) -> float | None:
 
 
 def sample_path(path: CameraPath, cameras: Cameras, depth: float, count: int) -> Cameras:
-    """Make the ``count`` cameras of a path, which leads through the cameras of a scene or around their middle.
+    """Make ``count`` cameras on a path that leads through the cameras of a scene, or around the middle one.
 
     Args:
         path: Kind and size of the path.
@@ -114,7 +114,7 @@ def outside_camera(cameras: Cameras, means: np.ndarray) -> tuple[Cameras, float]
     """Make a camera outside the capture: turn the middle camera about a point in front of it, and step back.
 
     The point is at the median depth of the ``means [n,3]``. Returns the camera, and the camera's distance from the
-    point, in world units. The fog of a result is measured from such cameras as well, see :mod:`gsmerge.measure.fog`.
+    point, in world units. The fog of a result is also measured from outside cameras, see :mod:`gsmerge.measure.fog`.
     """
     back, turn = FOG_CAMERAS["turned"][-1]
     middle, depth = cameras[[median_camera(cameras)]], viewing_depth(cameras, means)
@@ -135,9 +135,9 @@ def median_camera(cameras: Cameras) -> int:
 def orbit(cameras: Cameras, depth: float, count: int, turn: float | None = None) -> Cameras:
     """Turn the middle camera about the point ``depth`` in front of it, to the sides and up and down.
 
-    Frames are evenly spaced and form a loop. The picture keeps the vertical of the middle camera. ``turn`` is in
-    degrees to each side; up and down the orbit turns by half of this angle. By default the orbit is as wide as the
-    median offset of the cameras from the middle camera, within the limits ``HORIZONTAL`` and ``VERTICAL``.
+    Frames are evenly spaced and form a loop. The vertical of the picture stays that of the middle camera. The orbit
+    turns by ``turn`` degrees to each side, and by half of this angle up and down. By default the orbit is as wide as
+    the median offset of the cameras from the middle camera, within the limits ``HORIZONTAL`` and ``VERTICAL``.
     """
     middle = median_camera(cameras)
     viewmat = cameras.viewmats[middle].astype(np.float64)

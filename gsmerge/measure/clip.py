@@ -62,9 +62,9 @@ class Caption:
 def make_captions(texts: Sequence[tuple[str, str, str]], width: int, height: int) -> list[Caption]:
     """Place the captions of scenes side by side at the bottom of a frame, from left to right.
 
-    ``texts`` are the name, the count and the size of each scene. If there is room, count and size share a line. Without
-    this room, count and size each have their own line. A count that is too wide for its own line is broken between its
-    words. A name may be shortened. Other lines that do not fit are left out.
+    ``texts`` are the name, the count and the size of each scene. If there is room, count and size share a line,
+    otherwise each has a line. A count that is too wide for a line is broken between its words. A name may be shortened.
+    Other lines that do not fit are left out.
     """
     scale, thickness = max(0.45, height / 900), max(1, round(height / 600))
     line_height = round(LINE * scale)
@@ -116,8 +116,8 @@ def swipe_borders(count: int, frames: int, fps: float, width: int) -> list[list[
 def draw_swipe(pictures: Sequence[BytePicture], borders: Sequence[int], captions: Sequence[Caption]) -> BytePicture:
     """Make a frame from columns of pictures of several scenes, each with its caption, and draw lines between them.
 
-    All pictures are from one camera. ``borders`` are those of the frame, see :func:`swipe_borders`. The captions are
-    drawn into the pictures themselves.
+    All pictures are from one camera. ``borders`` are the borders of the columns, see :func:`swipe_borders`. The
+    captions are drawn into the pictures themselves.
     """
     frame = np.empty_like(pictures[0])
     lines_per_width = 480  # a line is as wide as a frame divided by this

@@ -15,7 +15,7 @@ from gsmerge.types import Gaussians, Scene
 def extents(gaussians: Gaussians) -> dict[str, Any]:
     """Measure positions and sizes of Gaussians with finite values, in world units.
 
-    Many Gaussians are measured on a sample.
+    If there are many Gaussians, a sample is measured.
     Returns:
         ``box_low`` and ``box_high``: percentiles 1 and 99 of the positions, for each axis. ``diagonal``: length of this
         box's diagonal. ``share_outliers``: share of positions outside the box enlarged ten times. ``share_floaters``:
@@ -43,7 +43,7 @@ def coverage(scene: Scene) -> list[dict[str, Any]]:
     """Measure how much of each view the Gaussians cover. If a photo has two layers, each layer is a view.
 
     Returns three entries for each view. ``name`` is the view's name. ``share_of_pixels`` is the share of the pixels
-    that have a visible Gaussian of their own, or None if the scene does not have one Gaussian per pixel.
+    from which a visible Gaussian comes, or None if the scene does not have one Gaussian per pixel.
     ``share_of_gaussians`` is the share of all Gaussians whose mean is inside the picture.
     """
     if len(scene) == 0:

@@ -34,7 +34,7 @@ def document_head() -> dict[str, Any]:
 
 
 def note_entries(notes: Iterable[str]) -> dict[str, Any]:
-    """Return the entries of a document for notes: all ``notes``, and the ``doubts`` among them."""
+    """Return two entries of a document: all ``notes``, and the ``doubts`` among these notes."""
     notes = list(notes)
     return {"notes": notes, "doubts": list_doubts(notes)}
 
@@ -83,8 +83,8 @@ def text_table(
 
     Each line begins with ``indent``. ``letters`` is the width of the terminal; None: unlimited. A table that is too
     wide is reduced until it fits. The columns with the numbers ``omitted_first`` are left out first, in this order. The
-    texts of the first column are shortened to ``MIN_NAME`` next. Other columns, except the first two, are left out at
-    the end, from the last on.
+    texts of the first column are shortened to ``MIN_NAME`` next. Then further columns are left out, from the last to
+    the third.
     """
     max_width = 10_000  # width of a table that is not printed on a terminal
     widths, room = [max(map(len, column)) for column in zip(*rows, strict=True)], (letters or max_width) - len(indent)
@@ -99,7 +99,7 @@ def text_table(
 
 
 def _cut(text: str, width: int) -> str:
-    """Shorten a text to ``width`` letters, with dots in place of its middle."""
+    """Shorten a text to ``width`` letters by replacing its middle with dots."""
     half = (width - 3) // 2
     return text if len(text) <= width else f"{text[: width - 3 - half]}...{text[-half:]}"
 

@@ -69,7 +69,7 @@ class DrawOptions:
     hints: ReadHints = NO_HINTS
     views: int | str | None = None  # largest number of views, or the name of one view; None: all, but four in a panel
     path: str | None = None  # text of gsmerge.measure.camera_path.parse_camera_path, or a file of cameras
-    frames: int | None = None  # frames of a path; None: SECONDS long, of a spline at least VIEW_FRAMES for each view
+    frames: int | None = None  # frames of a path; None: enough for SECONDS; for a spline also VIEW_FRAMES per view
     size: tuple[int, int] | None = None  # width and height of a picture; None: the size of the cameras
     background: float = 0.0  # grey level in [0, 1]
 
@@ -97,18 +97,18 @@ class Drawing:
 
     paths: list[Path]  # files of the pictures, or of the video
     facts: dict[str, Any]  # facts for the report
-    draw: Callable[[int], Iterator[BytePicture]]  # number of threads -> pictures; as many views are in memory
-    mode: int = 0o666  # most rights of new files, which are those of the photos that are drawn
+    draw: Callable[[int], Iterator[BytePicture]]  # number of threads -> pictures; each thread has one view in memory
+    mode: int = 0o666  # access rights of new files: at most those of the photos that are drawn
 
 
 @dataclass(frozen=True, eq=False)
 class DrawnScenes:
-    """Scenes to draw together. All scenes are in the frame of one scene, and are drawn in the views of this scene."""
+    """Scenes to draw together. All scenes share the frame of one scene, and are drawn in its views."""
 
     scenes: list[tuple[Path, Gaussians]]
     sizes: list[int]  # bytes of their files
     notes: list[str]
-    load: Loaded  # the scene with this frame and these views
+    load: Loaded  # the scene whose frame and views are used
 
     def counts(self) -> dict[str, int]:
         """Return the number of Gaussians of every scene by its path."""
@@ -124,8 +124,9 @@ class DrawnScenes:
     ) -> Iterator[tuple[BytePicture, ...]]:
         """Yield, for each camera, the 8-bit pictures of all scenes, with one view per thread in memory.
 
-        ``borders`` are those of each picture, see :func:`gsmerge.measure.clip.swipe_borders`. Scene i is shown between
-        the borders i and i + 1. Other columns of its picture need not be drawn, and may show the background only.
+        ``borders`` are the borders in each picture, see :func:`gsmerge.measure.clip.swipe_borders`. Scene i is shown
+        between the borders i and i + 1. Other columns of its picture need not be drawn, and may show the background
+        only.
         """
         settings: dict[str, Any] = {"at_once": threads, "near": near, "convert": to_picture}
         drawn = (
@@ -144,8 +145,8 @@ class DrawnScenes:
 def frame_files(files: SceneFiles, cameras: StrPath | None, images: StrPath | None) -> SceneFiles:
     """Find the files of the scene that defines the frame of the cameras.
 
-    For a compacted scene this is its source ``NAME.ply``, if that lies beside it. For any other scene it is the scene
-    itself. ``cameras`` and ``images`` are the options of the user.
+    For a compacted scene this is the source ``NAME.ply``, if it lies beside the compacted scene. For any other scene it
+    is the scene itself. ``cameras`` and ``images`` are the options of the user.
     """
     match = re.fullmatch(r"(.+)\.compact(\.level\d+)?(\.compressed)?\.(ply|spz|sog|splat|glb)", files.ply.name)
     if match is None or not (source := files.ply.with_name(f"{match[1]}.ply")).is_file():
@@ -173,7 +174,7 @@ def prepare_panel(options: DrawOptions) -> Drawing:
         if shown and options.size:
             shown = [None if photo is None else fill_photo(photo, *options.size) for photo in shown]
         rows = view_pictures(named, cameras[ids], shown, names, background=options.background)
-        # A scene without cameras has placed views: the first half is around the scene, and the second half inside it
+        # If the scene has no cameras, gsmerge placed the views, the first half around the scene, the others inside it
         outer_cameras = cameras if group.load.cameras is not None else cameras[: len(cameras) // 2]
         outside = outside_pictures(named, outer_cameras, photos=shown is not None, background=options.background)
         yield contact_sheet([*rows, outside])
@@ -254,7 +255,7 @@ def _make_path(options: DrawOptions) -> tuple[DrawnScenes, Cameras, float, list[
     file = None if path else Path(options.path)
     framing = options.framing
     has_own = framing.cameras is not None or framing.images is not None or read_sharp_camera(framing.ply) is not None
-    is_scene_file = file is not None and not has_own  # the scene has no other cameras than those of the path's file
+    is_scene_file = file is not None and not has_own  # the only cameras of the scene are in the path's file
     if is_scene_file:
         options = replace(options, framing=replace(options.framing, cameras=file))
     group = _read_scenes(options, photos=False)
@@ -288,9 +289,9 @@ DRAWINGS = {"panel": prepare_panel, "views": prepare_pictures, "path": prepare_c
 
 
 def _read_scenes(options: DrawOptions, *, photos: bool) -> DrawnScenes:
-    """Read the scenes, and the cameras of ``options.framing``, which show them.
+    """Read the scenes, and from ``options.framing`` the cameras that show the scenes.
 
-    If ``photos``, also read photos of the framing.
+    If ``photos``, also read the photos of these cameras.
     If there are no cameras, views are placed around the scene, and if ``photos`` also inside it.
     """
     files, framing, paths = options.files, options.framing, options.paths

@@ -62,7 +62,7 @@ class ViewScore:
     visible: float  # share of the pixels that the input views have seen
     full: Quality  # over all pixels
     masked: Quality  # over the pixels that the input views have seen (supplement A)
-    # Share of the pixels that the input covers, because these have a Gaussian of their own, or an opacity above a half.
+    # Share of the pixels that the input covers, by a Gaussian that comes from the pixel, or by an opacity above a half.
     # None if the input was not measured
     covered_share: float | None = None
     covered: Quality = Quality()  # PSNR and SSIM over these pixels
@@ -74,7 +74,7 @@ class ResultScores:
 
     name: str  # as the caller gave it
     num_gaussians: int
-    ratio: float  # number of Gaussians, divided by that of the input
+    ratio: float  # number of Gaussians, divided by the input's number
     render_seconds: float  # median wall time of one view with all threads
     scores: tuple[ViewScore, ...]  # one for each view
     fog: Mapping[str, Fog] = field(default_factory=dict)  # by kind of camera; empty for the input, or if not measured
@@ -159,13 +159,13 @@ class _Split:
 
     views: Views
     visible: NDArray[np.bool_]  # [v,h,w] pixels that the input views have seen
-    covered: NDArray[np.bool_] | None  # [v,h,w] pixels that the input covers; None: where renders of it are opaque
+    covered: NDArray[np.bool_] | None  # [v,h,w] pixels that the input covers; None: where the input is opaque
     reference: str  # words for the pictures with which results are compared, such as "photos"
     scored: Sequence[int]  # ids of the views that are scored
     drawn: Gaussians | None = None  # the input, if its renders replace photos; otherwise None
 
     def move_to(self, cameras: Cameras | None) -> _Split:
-        """Return the split with a result's own cameras. Renders of the input keep the cameras that drew them."""
+        """Return the split with the cameras of a result. Renders of the input keep the cameras that drew them."""
         view_cameras = self.views.cameras if cameras is None or self.drawn is not None else cameras
         return replace(self, views=replace(self.views, cameras=view_cameras))
 
@@ -203,10 +203,10 @@ def evaluate(
     Args:
         scene: The input. Without photos, results are compared with renders of the scene.
         results: Results of :func:`gsmerge.compact`, or Gaussians, by name, in the scene's world.
-        targets: Held-out views in that world, see :func:`gsmerge.scene.held_out.read_held_out`.
+        targets: Held-out views in the scene's world, see :func:`gsmerge.scene.held_out.read_held_out`.
         options: Settings; None: the defaults, with LPIPS if its weights are installed.
-        cameras: Cameras of the input views, by name of a result, if the result was made with other poses than the
-            scene has. A result has these cameras as ``CompactResult.cameras``.
+        cameras: Cameras of the input views, by name of a result, for results that were made with other poses than the
+            scene's. Such a result has these cameras as ``CompactResult.cameras``.
         progress: Called with (name of the step, number done, total); the step of a result is "evaluate: NAME".
         on_image: Called with (result, split, number of the view in the split, render ``[h,w,3]`` in [0, 1]).
 
@@ -254,7 +254,7 @@ def evaluate(
             on_image(name, kind, view, image)
             progress(f"evaluate: {name}", next(numbers), num_pictures)
 
-        renderer.image(inputs[:1], scene.cameras, 0)  # loads the kernels, so that this is not part of a result's time
+        renderer.image(inputs[:1], scene.cameras, 0)  # loads the kernels, before times are measured
         split_scores = [
             _score_split(kind, split, scored, cameras if kind == "context" else {}, renderer, report_image)
             for kind, split in splits.items()
@@ -321,8 +321,8 @@ def _make_splits(
 ) -> dict[str, _Split]:
     """Return the input views and the held-out views by the name of the split, with the pixels that count.
 
-    Input views have the scene's pictures, which ``reference`` describes. A scene without pictures gets renders of the
-    Gaussians ``inputs`` in their place.
+    Input views have the scene's pictures, which ``reference`` describes. If the scene has no pictures, renders of the
+    Gaussians ``inputs`` replace them.
     """
     side = renderer.options.photo_side
     cameras = shrink_cameras(scene.cameras, side)
@@ -330,7 +330,7 @@ def _make_splits(
     points = context_points(scene, renderer.near, sources)
 
     def make_split(views: Views, words: str, masks: np.ndarray | None = None) -> _Split:
-        """Return a split; ``words`` describe the pictures of its views, and pixels outside ``masks`` do not count."""
+        """Return a split; ``words`` describe the pictures of the views, and pixels outside ``masks`` do not count."""
         visible, scored = visible_pixels(points, views.cameras, renderer.near, sources), list(range(len(views.names)))
         if masks is not None:
             visible &= [resize_mask(mask, cameras.width, cameras.height) for mask in masks]
@@ -363,8 +363,8 @@ def _score_split(
     """Draw and score all results, one view after the other.
 
     Returns, by the name of each result, the seconds of drawing and the score of each view. A split is a set of views:
-    the input views, or held-out ones. ``kind`` is its name. ``cameras`` has the cameras of the results that were made
-    with other poses than the scene has.
+    the input views, or held-out ones. ``kind`` is its name. If a result was made with other poses than the scene's,
+    ``cameras`` has its cameras.
     """
     options, names = renderer.options, split.views.names
     lpips_views = pick_views(len(names), options.lpips_views or len(names))

@@ -1,9 +1,10 @@
 """Measure fog, veils, holes and spikes: errors of a compact scene that only show from outside the views.
 
-Photos score a scene from their own viewpoints only, but a person who views the scene first steps back and turns. From
-outside, Gaussians in gaps between the views show as haze, and Gaussians of wrong depth show as veils before surfaces.
-Gaps in surfaces show as holes. Long thin Gaussians, which look like texture in one view, show as strokes. Photos are
-not needed, only the input and the cameras of its views. docs/guide/evaluate.md explains the figures to users.
+Photos score a scene only from the viewpoints of the photos, but a person who views the scene first steps back and
+turns. From outside, Gaussians in gaps between the views show as haze, and Gaussians of wrong depth show as veils before
+surfaces. Gaps in surfaces show as holes. Long thin Gaussians, which look like texture in one view, show as strokes.
+Photos are not needed, only the input and the cameras of its views. docs/guide/evaluate.md explains the figures to
+users.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ VIEWS = 3  # evenly spread input views from which the cameras start
 # Outside cameras by kind, as pairs of a share and an angle. A camera steps back from an input view, by this share of
 # the view's median depth. Then the camera turns about the point in the view's middle, by this angle in degrees
 FOG_CAMERAS = {"back": ((0.5, 0), (1.5, 0)), "turned": ((0.5, -30), (0.5, 30))}
-ALL = "all"  # kind that stands for all of these cameras
+ALL = "all"  # kind that stands for the outside cameras of all kinds
 FOG_PIXELS = 480  # longer side of the pictures is at most this, pixels
 # A pixel of the input is empty if its opacity is below FOG_EMPTY, and solid if its opacity is above FOG_SOLID. A solid
 # pixel of the input is a hole of a result if the result has an opacity below FOG_OPEN in this pixel
@@ -46,18 +47,19 @@ FOG_NEAR_PLANE = 0.25  # near plane of the depths of both scenes, as a share of 
 class Fog:
     """Fog, veils, holes and spikes of a result, seen from outside and compared with its input.
 
-    A figure is None if there is no pixel on which it can be measured.
+    A figure is None if it can be measured on no pixel.
 
     Args:
         fog_near: Mean opacity, in [0, 1], where the input is empty.
-        fog_far: Mean opacity of the pixels that are farther than a tenth of the width from all that the input shows.
+        fog_far: Mean opacity of the pixels that are more than a tenth of the width away from every pixel in which the
+            input shows anything.
         holes: Share of the pixels with a solid input in which the result has an opacity below a half.
         veil: Share of the pixels with a solid input in which the depth of the result is less than 0.7 of the input's
             depth. This share is a mean over the cameras.
         veil_worst: The largest veil of a single camera.
         spikes: Share of the pixels that change visibly if all spikes are removed. A spike is longer than 5 % of the
             width, and at least five times as long as its second axis.
-        strokes: Like ``spikes``, but with spikes that are at least three times as long as their second axis.
+        strokes: Like ``spikes``, but a spike is at least three times as long as its second axis.
     """
 
     fog_near: float | None = None
@@ -87,8 +89,8 @@ def measure_fog(
 ) -> dict[str, dict[str, Fog]]:
     """Measure fog, veils, holes and spikes of results, by name, from outside the ``cameras`` of a ``reference`` scene.
 
-    Returns, by the name of a result and the kind of camera, a :class:`Fog` of all pictures of this kind. Kinds are
-    those of :data:`FOG_CAMERAS`, and "all". ``near`` is the near plane of the pictures, in world units.
+    Returns, by the name of a result and the kind of camera, a :class:`Fog` of all pictures of this kind. Kinds are the
+    keys of :data:`FOG_CAMERAS`, and "all". ``near`` is the near plane of the pictures, in world units.
     """
     reference_splats = make_splats(reference)
     splats = {name: make_splats(result) for name, result in results.items()}
@@ -133,7 +135,7 @@ def fog_cameras(gaussians: Gaussians, cameras: Cameras) -> Iterator[tuple[str, C
 
 
 def draw_depths(splats: Splats, camera: Cameras, near: float, depth_near: float) -> OutsidePicture:
-    """Draw the opacities of one outside camera with the near plane ``near``, and with the plane ``depth_near``.
+    """Draw the opacities in one outside camera twice, with ``near`` and with ``depth_near`` as the near plane.
 
     Depths are drawn with ``depth_near`` only. Both planes are in world units.
     """
@@ -183,8 +185,8 @@ def mean_fog(sums: np.ndarray) -> Fog:
     """Make the figures of a :class:`Fog` from ``sums [pictures,6,2]`` of several pictures.
 
     A picture has the four rows of :func:`sum_pixels`, and the two rows of :func:`count_spikes`. A figure is the sum
-    over all pictures, divided by the number of these pictures' pixels. For veils, each picture's sum is divided by the
-    picture's pixels, and the shares are then averaged.
+    over all pictures, divided by the number of pixels over which it was taken. Veils are divided picture by picture,
+    and the shares are then averaged.
     """
     near, far, holes, _, *spikes = (total / count if count else None for total, count in sums.sum(0).tolist())
     veils = [total / count for total, count in sums[:, 3].tolist() if count]

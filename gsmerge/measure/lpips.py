@@ -42,7 +42,7 @@ class _Conv:
     stride: int = 1
     padding: int = 1
     pool: int = 0  # pixels per side of a max pooling with stride 2 before the convolution; 0: no pooling
-    compared: bool = True  # True: its features enter the distance
+    compared: bool = True  # True if the features of this layer enter the distance
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class _Architecture:
 
     file: str
     trunk: str  # key of the convolutions in the file
-    min_size: int  # least pixels per side of an image, with which the last layer still has one pixel
+    min_size: int  # least pixels per side of an image; the last layer then still has one pixel
     convs: tuple[_Conv, ...]
 
 
@@ -90,9 +90,9 @@ def lpips(image: Array, reference: Array, net: str = "vgg", mask: Array | None =
     """Measure the learned perceptual distance (LPIPS 0.1, Zhang et al. 2018): 0 for equal images, lower is closer.
 
     The images are ``[h,w,3]`` sRGB in [0, 1], arrays or tensors, with at least 16 x 16 pixels for ``"vgg"`` (VGG-16)
-    and 31 x 31 for ``"alex"`` (AlexNet). Distances of the two networks cannot be compared. Pixels outside
-    ``mask [h,w]`` are copied from ``reference`` before the networks see them, so they do not differ. The mean is taken
-    over the whole image, with the copied pixels.
+    and 31 x 31 for ``"alex"`` (AlexNet). Distances by different networks cannot be compared. Pixels outside ``mask
+    [h,w]`` are first copied from ``reference``, so that they do not differ. The mean is taken over the whole image,
+    with the copied pixels.
 
     Raises:
         GsmergeError: If the package with the weights is not installed.
@@ -129,7 +129,7 @@ def require_lpips(net: str) -> Path:
 
 
 def min_size(net: str) -> int:
-    """Return the smallest image side, pixels, that ``net`` takes."""
+    """Return the smallest image side, in pixels, with which ``net`` works."""
     return _architecture(net).min_size
 
 

@@ -21,8 +21,8 @@ from gsmerge.types import Cameras, Gaussians
 BytePicture = NDArray[np.uint8]  # [h,w,3], sRGB
 FACE = cv2.FONT_HERSHEY_SIMPLEX
 MAX_SIDES = {".webp": 16383, ".jpg": 65500, ".jpeg": 65500}  # largest side that a format or its encoder takes, pixels
-# Height of the label above a picture that is narrower than twice LABEL_WIDTH, pixels. Wider pictures have a label that
-# is a whole number of times as high
+# Height of the label above a picture that is narrower than twice LABEL_WIDTH, pixels. For wider pictures this height is
+# multiplied by a whole number
 LABEL_HEIGHT, LABEL_WIDTH = 22, 640
 LABEL_LEVEL = 32  # grey level of labels, and of cells without a photo
 GAP_PIXELS = 4  # pixels between pictures
@@ -83,9 +83,9 @@ def view_pictures(
     """Render each scene in every view; return a row of pictures for each view, each with a line of text.
 
     A row begins with the photo ``[h,w,3]``, or with a dark picture if the photo is None. If ``photos`` is None, rows
-    have scenes only. The text of a photo has the name of the view. The text of a scene has its name, the number of its
-    Gaussians, and the PSNR against the photo or, if ``photos`` is None, against the first scene. ``drawing`` is passed
-    to :func:`gsmerge.render`.
+    have scenes only. The text of a photo has the name of the view. The text of a render has the scene's name, its
+    number of Gaussians, and the PSNR against the photo or, if ``photos`` is None, against the render of the first
+    scene. ``drawing`` is passed to :func:`gsmerge.render`.
     """
     renders = [render(gaussians, cameras, **drawing).images.clip(0, 1) for _, gaussians in scenes]
     views = []
@@ -109,8 +109,8 @@ def outside_pictures(
 ) -> list[tuple[str, BytePicture]]:
     """Render each scene from outside the capture; return a row of pictures, each with a line of text.
 
-    The row fits below those of :func:`view_pictures`. If ``photos``, the rows of :func:`view_pictures` begin with
-    photos. There is no photo from outside, so the row of this function begins with a dark picture.
+    The row fits below the rows of :func:`view_pictures`. If these rows begin with ``photos``, the row from outside
+    begins with a dark picture, because there is no photo from outside.
     """
     camera, _ = outside_camera(cameras, scenes[0][1].means)
     renders = [

@@ -15,7 +15,7 @@ from gsmerge.runtime.memory import human_bytes, human_share
 Row = Sequence[str]
 TextTable = tuple[str, Row, Sequence[Row]]  # heading, columns, rows
 
-SPLIT_WORDS = {"context": "input", "target": "held-out"}  # what the views of a split are called
+SPLIT_WORDS = {"context": "input", "target": "held-out"}  # words for the views of a split
 SIMPLE = ("psnr", "ssim")  # measures that are also taken over the pixels that the input covers
 SCORE_COLUMNS = {"psnr": "PSNR (dB)", "ssim": "SSIM", "lpips_vgg": "LPIPS VGG", "lpips_alex": "LPIPS AlexNet"}
 METRICS = tuple(field.name for field in fields(Quality))
@@ -23,7 +23,7 @@ OUTSIDE_COLUMNS = {
     "fog_near": "near fog", "fog_far": "far fog", "holes": "holes", "veil": "veil", "veil_worst": "worst veil",
     "spikes": "spikes", "strokes": "strokes",
 }  # fields of Fog  # fmt: skip
-# Columns that a table for a narrow terminal lacks; the first one goes first
+# Columns that are left out of a table for a narrow terminal, in this order
 OMITTED_FIRST = ("bytes each", "smaller by", "ms/view", "kept")
 MASKED_SUFFIX = "_visible"  # suffix of measures over the pixels that the input views have seen
 COVERED_SUFFIX = "_covered"  # suffix of measures over the pixels that the input covers
@@ -156,7 +156,7 @@ def _describe_options(document: Mapping[str, Any]) -> str:
 
 
 def _size_row(result: Mapping[str, Any], first: Mapping[str, Any]) -> Row:
-    """Return the row of a result in the table of sizes, where its size is compared with that of ``first``."""
+    """Return the row of a result in the table of sizes, which compares the result's size with the size of ``first``."""
     size, input_size = result.get("bytes"), first.get("bytes")
     bytes_each = sum(result.get("bytes_by_attribute", {}).values()) / max(result["num_gaussians"], 1)
     return (

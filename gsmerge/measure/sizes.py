@@ -31,7 +31,7 @@ def shrink_cameras(cameras: Cameras, side: int) -> Cameras:
 def fill_cameras(cameras: Cameras, width: int, height: int) -> Cameras:
     """Return cameras whose images ``[height,width]`` are resized and cropped, like those of :func:`fill_photo`.
 
-    The old image is resized until it covers the new size. The rest is cropped evenly at both ends.
+    The old image is resized until it covers the new size. What exceeds the new size is cropped evenly at both ends.
     """
     new_width, new_height = _filling_size(cameras.width, cameras.height, width, height)
     resized = resize_cameras(cameras, new_width, new_height)

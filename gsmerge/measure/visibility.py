@@ -17,14 +17,14 @@ from gsmerge.types import Cameras, Gaussians, Scene
 
 Points = NDArray[np.float64]  # [n,3]
 VISIBILITY_GAUSSIANS = 200_000  # largest sample of Gaussians on which a share is measured
-_CHUNK = 1 << 16  # number of points that are processed at a time; often the first ones already mark all pixels
+_CHUNK = 1 << 16  # number of points that are processed at a time; often the first points already mark all pixels
 
 
 def context_points(scene: Scene, near: float, cameras: Cameras | None = None) -> Points:
     """Return the surface points ``[n,3]``, in world units, that the pixels of the input views show.
 
-    If each view has Gaussians of its own, the points are the means of these Gaussians. If not, the points follow from
-    depths, rendered beyond ``near`` (world units) in ``cameras``. None: the scene's cameras.
+    If each Gaussian comes from one view, the points are the means of the Gaussians. Otherwise the points are computed
+    from depths, rendered beyond ``near`` (world units) in ``cameras``. None: the scene's cameras.
     """
     if scene.has_own_pixels:
         return scene.file_gaussians.means.astype(np.float64)
@@ -33,7 +33,7 @@ def context_points(scene: Scene, near: float, cameras: Cameras | None = None) ->
 
 
 def _render_points(gaussians: Gaussians, camera: Cameras, near: float) -> Points:
-    """Render the depths of one camera, and return the points ``[n,3]`` at these depths; faint pixels have none."""
+    """Render the depths of one camera, and return the points ``[n,3]`` at these depths; faint pixels give no point."""
     drawn = render(gaussians, camera, near=near, with_depths=True)
     assert drawn.depths is not None
     depths = drawn.depths[0, ..., 0]

@@ -43,7 +43,7 @@ class Side:
     splats: bytes | None  # the Gaussians in the page's frame, see :func:`pack_splats`; None: too many for a page
     sh_degree: int  # degree of the harmonics in the page
     file_sh_degree: int  # degree of the harmonics in the file
-    covered_share: float | None  # share of the pixels of the views of ``mean`` that the input covers
+    covered_share: float | None  # share of the pixels that the input covers, in the views of ``mean``
     covered: Quality  # mean over the covered pixels of these views
     seconds: float  # time to draw a view on this machine, with all threads
     new_gain: tuple[float, float] | None = None  # bounds of the expected gain of new views, dB; None: not known
@@ -54,10 +54,10 @@ class PageView:
     """A view that the page can jump to."""
 
     name: str
-    place: int  # index among all views, of which the input views are first
+    place: int  # index among all views; the input views come first
     held_out: bool
     camera: Cameras  # one camera, in the page's frame
-    distance: float  # median depth of the scene, in units of that frame
+    distance: float  # median depth of the scene in the view, in units of the page's frame
     photo: bytes | None  # WebP
     stills: tuple[bytes, ...]  # WebP, one for each side
     scores: tuple[Quality, ...]  # one for each side, over the pixels that the input views have seen
@@ -70,7 +70,7 @@ class ViewData:
 
     title: str  # name of the scene
     sides: tuple[Side, ...]  # the scene itself, then its results
-    views: tuple[PageView, ...]  # the worst first, by the scores of the first result; without results, of the scene
+    views: tuple[PageView, ...]  # the worst first, by the scores of the first result or, without results, of the scene
     outside: PageView  # the view from outside the capture
     num_views: int  # number of measured views; `views` may have fewer
     reference: str  # words for the pictures against which scores are measured
@@ -80,7 +80,7 @@ class ViewData:
 
     @property
     def shown(self) -> tuple[PageView, ...]:
-        """All views that the page can jump to: the measured ones, then the view from outside."""
+        """All views that the page can jump to: the measured views, then the view from outside."""
         return (*self.views, self.outside)
 
     @property
@@ -125,7 +125,8 @@ def collect_page_data(
     ``results`` are Gaussians by name in the scene's world, and may be empty. ``file_bytes`` are the file sizes of the
     scene and of the results. Stills and scores use ``cameras`` (see :func:`gsmerge.evaluate`); 3D uses the scene's
     cameras. ``new_gains`` says, by result, how much better new views are expected to be: a lower and an upper bound in
-    dB. A result that is worse than the scene gets no gain. If ``light``, the scene itself is shown in stills only.
+    dB. For a result that is worse than the scene, no gain is shown. If ``light``, the scene itself is shown in stills
+    only.
     """
     stills: Stills = {}
 
@@ -185,7 +186,7 @@ def _fill_page(
 def _with_gains(data: ViewData, gains: Mapping[str, tuple[float, float]]) -> ViewData:
     """Return the content with the expected gains of results.
 
-    A result that shows the photos of the fit worse than the scene does gets a note in place of a gain.
+    If a result shows the photos of the fit worse than the scene does, it gets a note instead of a gain.
     """
     sides, notes = [], list[str]()
     for side in data.sides:
@@ -203,7 +204,7 @@ def _with_gains(data: ViewData, gains: Mapping[str, tuple[float, float]]) -> Vie
 def _list_views(
     splits: Mapping[str, SplitViews], evaluation: Evaluation, stills: Stills, frame: Frame, means: np.ndarray
 ) -> list[PageView]:
-    """List the measured views of all splits. The ``distance`` of each is the median depth of ``means [n,3]``."""
+    """List the measured views of all splits. A view's ``distance`` is the median depth of ``means [n,3]`` in it."""
     views: list[PageView] = []
     for split, (cameras, photos, names) in splits.items():
         encoded: list[bytes | None] = [encode_still(to_picture(photo)) for photo in photos]
@@ -258,7 +259,7 @@ def encode_still(picture: BytePicture) -> bytes:
 def _pack_side(
     gaussians: Gaussians, name: str, scene: Scene, cameras: Cameras, light: bool
 ) -> tuple[bytes | None, int, int]:
-    """Pack one side's Gaussians for the page; return the bytes, the SH degree in the page, and that in the file.
+    """Pack one side's Gaussians for the page; return the bytes, and the SH degrees in the page and in the file.
 
     ``gaussians`` and ``cameras`` are in the canonical frame. A ``light`` page leaves out the Gaussians of the scene
     itself, and the bytes are then None.

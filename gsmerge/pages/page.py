@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 # Content security policy: a page may run only its own scripts and styles, which the policy names by their hashes
 PICTURES_POLICY = "default-src 'none'; img-src data:; style-src {style}; script-src {script}"
-# The 3D viewer Spark needs WebAssembly and a worker. The viewer's script holds both as data: and blob: addresses
+# The 3D viewer Spark needs WebAssembly and a worker. The viewer's script contains both, as data: and blob: addresses
 SOLID_POLICY = f"{PICTURES_POLICY} blob: 'wasm-unsafe-eval'; worker-src data: blob:; connect-src data: blob:"
 POLICY_MARK = "{policy}"  # placeholder in the templates until the hashes are known
 VIEWER = Path(__file__).parent / "vendor/spark-three.js.gz"
@@ -141,7 +141,7 @@ def _closer_or_farther(gain: float) -> str:
 
 
 def agreement_words(data: ViewData) -> str:
-    """Describe the share of the depth that other views confirm, or say what would raise a small share."""
+    """Say how much of the depth other views confirm or, if it is little, what would raise this share."""
     if data.agreement is None:
         return ""
     return data.agreement.advice or f"{100 * data.agreement.confirmed:.0f} % of the depth is confirmed by other views"
@@ -212,10 +212,11 @@ def list_figures(data: ViewData, side_id: int) -> list[Figure]:
 
 
 def _score_figure(label: str, name: str, old: float | None, new: float | None, *, own: bool, is_result: bool) -> Figure:
-    """Make the figure of a mean score, which is ``old`` for the scene itself and ``new`` for one side of the page.
+    """Make the figure of a mean score, which is ``old`` for the scene itself and ``new`` for one side (scene or result)
+    of the page.
 
-    ``label`` is shown, and ``name`` is the metric. ``own`` is True if scores are over the photos of the fit.
-    ``is_result`` is True if the side is not the scene itself.
+    ``label`` is shown, and ``name`` is the metric. ``own`` is True if scores are measured on the photos that the fit
+    used. ``is_result`` is True if the side is not the scene itself.
     """
     digits, unit = (2, " dB") if name == "psnr" else (3, "")
     is_better = is_result and old is not None and new is not None and old < new
@@ -228,7 +229,7 @@ def _score_figure(label: str, name: str, old: float | None, new: float | None, *
 
 
 def reference_words(data: ViewData) -> tuple[str, bool]:
-    """Return words for the pictures with which scores compare, and True if a fit may have used the same pictures."""
+    """Return words for the pictures behind the scores, and True if a fit may have used these pictures."""
     if data.held_out:
         return "held-out photos", False
     return ("its own photos", True) if data.reference == PHOTOS else (data.reference, False)

@@ -17,7 +17,7 @@ from gsmerge.types import SH_C0, Cameras, Gaussians
 
 MAX_GAUSSIANS = 2_000_000  # larger scenes have only stills, since a page gets too large and loads too slowly
 MAX_SPZ_BYTES = 40_000_000  # before compression; enough for 2 million Gaussians without harmonics
-COARSE_COUNT = 300_000  # Gaussians of larger scenes are as small as pixels and may be less exact
+COARSE_COUNT = 300_000  # larger scenes have Gaussians as small as pixels, which may be less exact
 # Step sizes of opacity, colour and logarithm of the scale, in steps of a .spz, and the number of steps of a rotation
 # from 0 to half a turn. With COARSE, pictures have a PSNR of 50 dB against pictures of the exact scene
 EXACT, COARSE = ((1, 1, 1), 255), ((16, 2, 2), 31)
@@ -36,9 +36,10 @@ def pack_splats(
     the sign. All low bytes of a column come first, then the higher bytes. Neighbouring rows are similar, so the bytes
     take 40 to 70 % of the ``.spz``.
 
-    ``homes [n]`` is the pixel of each Gaussian, numbered over the pictures of all ``cameras``, or -1. If all Gaussians
-    have a pixel, a depth and a shift within the pixel are stored in place of a position. ``gaussians`` and ``cameras``
-    are in the page's frame. The scene has a size of about 1 in this frame, since browsers keep means in 16 bits.
+    ``homes [n]`` is the pixel of each Gaussian, numbered over the pictures of all ``cameras``, or -1. If every Gaussian
+    has a pixel, its depth and its shift within the pixel are stored instead of its position. ``gaussians`` and
+    ``cameras`` are in the page's frame. The scene has a size of about 1 in this frame, since browsers keep means in 16
+    bits.
     """
     rows, means = drawn_rows(gaussians), np.ascontiguousarray(gaussians.means, np.float32)
     count = len(rows)
@@ -103,7 +104,7 @@ def drawn_rows(gaussians: Gaussians) -> np.ndarray:
 
 
 def _pixel_positions(rows: np.ndarray, means: np.ndarray, cameras: Cameras, homes: np.ndarray) -> np.ndarray | None:
-    """Return the positions of ``rows [m]`` relative to their pixels; ``homes [n]`` are the pixels of all rows.
+    """Return where the Gaussians ``rows [m]`` are, relative to their pixels; ``homes [n]`` are the pixels of all rows.
 
     Row 0 of the result ``[4,m]`` has the pixels, rows 1 and 2 the shifts within them, and row 3 the logarithms of the
     depths. The result is None if a Gaussian cannot be stored like this, for example if it is behind its camera.

@@ -80,10 +80,11 @@ def view(
 
     Args:
         scene: A scene from :func:`gsmerge.read_scene`, or the path that it reads.
-        results: Results of the scene by name, or one result: from :func:`gsmerge.compact`, Gaussians, or paths of
-            files.
+        results: Results of the scene by name, or one result. A result comes from :func:`gsmerge.compact`, or is
+            Gaussians, or the path of a file.
         held_out: Views with photos that were not part of the input, for scores.
-        light: Show the scene itself in stills only; None: in stills only if it has more than 600,000 Gaussians.
+        light: If True, the scene itself is shown in stills only. None: True if the scene has more than 600,000
+            Gaussians.
         progress: Called with (name of the step, number done, total).
 
     Returns:
@@ -125,7 +126,7 @@ def view(
 
 
 def file_gains(files: Mapping[str, GaussianFile]) -> dict[str, tuple[float, float]]:
-    """Return the bounds of the expected gain of new views, in dB, of the results whose files store them."""
+    """Return the bounds of the expected gain of new views, in dB, by the name of each result whose file states them."""
     known = {name: read_expected_scores(file.info.comments) for name, file in files.items()}
     return {name: scores.bounds for name, scores in known.items() if scores}
 
@@ -133,7 +134,7 @@ def file_gains(files: Mapping[str, GaussianFile]) -> dict[str, tuple[float, floa
 def _num_bytes(value: Any) -> int:
     """Return the size in bytes of a scene's files, or of a file that was read.
 
-    Gaussians that come from no file get the size of their ``.ply``.
+    For Gaussians that come from no file, it is the size that a ``.ply`` would have.
     """
     if isinstance(value, GaussianFile):
         return value.info.file_bytes

@@ -56,14 +56,14 @@ class StressScene:
 
 
 def keep_views(setup: StressScene, choose: Callable[[int], Sequence[int]]) -> StressScene:
-    """Keep only some views of a scene. ``choose`` takes the number of views, and returns the ids of those to keep."""
+    """Keep only some views of a scene. ``choose`` takes the number of views, and returns the ids of the kept views."""
     return replace(setup, scene=subset(setup.scene, choose(len(setup.scene))))
 
 
 def scale_and_shift(setup: StressScene, factor: float, shift: Sequence[float]) -> StressScene:
     """Scale the world by ``factor``, then shift it by ``shift`` times the size that the scene has after scaling."""
     scene, views = setup.scene, setup.views
-    # ``frame`` is the frame in which the scene stands before it is moved to the world
+    # the scene's present coordinates are taken as coordinates in ``frame``, and are then moved to the world
     frame = Frame(np.array(shift, np.float64) * scene_frame(scene).unit * factor, factor)
     scene = replace(scene, gaussians=frame.leave(scene.gaussians), cameras=frame.leave_cameras(scene.cameras))
     return StressScene(scene, views and replace(views, cameras=frame.leave_cameras(views.cameras)))
@@ -92,7 +92,7 @@ def change_exposure(setup: StressScene, share: float) -> StressScene:
 
 
 def break_rows(setup: StressScene) -> StressScene:
-    """Remove 1 % of the rows at random, but at least one.
+    """Remove 1 % of the rows at random, but at least one row.
 
     Scenes can lack rows, because the reader of files removes rows with NaN.
     """
@@ -109,7 +109,7 @@ class Case:
     name: str  # name on the command line
     words: str  # description of the change
     check: Check  # name of the property that must hold, see ``PROPERTIES``
-    needs: Needs = "anything"  # of a scene: one Gaussian per pixel ("pixels"), or also photos ("photos")
+    needs: Needs = "anything"  # what a scene needs: one Gaussian per pixel ("pixels"), or also photos ("photos")
     change: Callable[[StressScene], StressScene] | None = None  # returns the changed scene; None: the scene stays
 
 
@@ -242,16 +242,16 @@ def _measure_psnr(setup: StressScene, gaussians: Gaussians) -> tuple[float, floa
 
 
 def _fit_slack(options: CompactOptions) -> float:
-    """Return by how many dB more a result may be worse because its options have a full fit."""
-    fit_slack = 1.0  # dB; after a full fit, thin structures and so the PSNR depend on rounding by up to this
+    """Return how many dB more than usual a result may lose, because of a full fit in its options."""
+    fit_slack = 1.0  # dB; rounding may change the PSNR by this after a full fit, because thin structures depend on it
     return fit_slack if options.fit.fit == "full" else 0.0
 
 
 def _check_result(case: Case, base: _ScoredResult, result: _ScoredResult, slack: float) -> tuple[bool, str]:
     """Compare a result with its own input, or with the result ``base`` of the unchanged scene, as the case requires.
 
-    Returns True if the property of the case holds, and the compared figures. ``slack`` is how many dB more a result may
-    lose because of its fit.
+    Returns True if the property of the case holds, and the compared figures. ``slack`` is how many dB more than usual a
+    result may lose because of its fit.
     """
     figures = f"{len(result.gaussians):,} Gaussians, {result.after:.2f} dB"
     with_base = f"{figures}; unchanged {len(base.gaussians):,}, {base.after:.2f} dB"
@@ -268,9 +268,9 @@ def _check_result(case: Case, base: _ScoredResult, result: _ScoredResult, slack:
 
 
 def _check_again(setup: StressScene, base: _ScoredResult, options: CompactOptions) -> tuple[bool, str]:
-    """Compact the result ``base`` a second time without reducing it, and check that the quality stays.
+    """Compact the result ``base`` a second time to the same number of Gaussians, and check that the quality stays.
 
-    Returns True if the quality stays, and the PSNR after and before the second run.
+    Returns whether the quality stays, and words with the PSNR after and before the second run.
     """
     scene = setup.scene
     unaligned = Scene(base.gaussians, scene.cameras, scene.images, None, scene.names)

@@ -66,7 +66,7 @@ class BudgetOptions(Settings):
 
     @property
     def leaves_open(self) -> bool:
-        """True if the budget leaves the number of Gaussians to the scene, without a limit or with that of a device."""
+        """True if the scene decides the number of Gaussians, without a limit or up to the limit of a device."""
         return self.budget in (None, AUTO, *DEVICES)
 
     @property
@@ -76,7 +76,8 @@ class BudgetOptions(Settings):
 
     @property
     def is_limit(self) -> bool:
-        """True if the budget is a share, a size or a device, of which a run uses only what improves new views."""
+        """True if the budget is a share, a size or a device, and a run uses only as much of it as improves new
+        views."""
         return not self.fill and not self.auto and self.budget is not None and self.number is None
 
     @property

@@ -39,8 +39,8 @@ RECIPES: Mapping[str, Mapping[str, Any]] = {
 }  # fmt: skip
 # Settings that decide the number of Gaussians
 COUNTS = ("superpixels", "k", "budget")
-# Settings of a run on a part of a scene, such as a block of views. The usual values of these settings would need the
-# whole scene
+# Settings of a run on a part of a scene, such as a block of views. With their usual values, these settings would need
+# the whole scene
 ONE_PIECE: dict[str, Any] = {"poses": "fixed", "exposure": "fixed", "blocks": "none", "new_views": False}
 # Settings of a trial, which is a short run on some of the views
 TRIAL: dict[str, Any] = {
@@ -50,7 +50,7 @@ TRIAL: dict[str, Any] = {
 
 
 def method_names() -> tuple[str, ...]:
-    """Return the names of all methods: the built-in one, and those of installed plugins."""
+    """Return the names of all methods: the built-in method, and the methods of installed plugins."""
     return (OURS, *find_plugins(METHODS))
 
 
@@ -116,7 +116,7 @@ class CompactOptions(Settings):
     def scene_decides(self) -> bool:
         """True if no setting decides the number of Gaussians, so that a run may choose it for the scene.
 
-        False also if settings replace the usual stages, because other stages seldom keep the quality of the input.
+        Also False if settings replace the usual stages, because other stages seldom keep the quality of the input.
         """
         deciding = [name for name in self.changed_counts if name != "budget" or not self.budget.leaves_open]
         return not (deciding or self.budget.quality is not None or self.replaces_stages)
@@ -158,7 +158,7 @@ class CompactOptions(Settings):
         return [*self.whole_only, *self.blocks.asked]
 
     def changed(self, names: Iterable[str]) -> list[str]:
-        """Return those of the ``names`` whose settings differ from their defaults; all names are flat."""
+        """Return those ``names`` of settings whose values differ from the defaults; all names are flat."""
         values, declared = self.to_dict(), flat_settings(CompactOptions)
         return [name for name in names if values[name] != declared[name].default]
 

@@ -38,7 +38,7 @@ class ReadHints(Settings):
 
 @dataclass(frozen=True)
 class FileHints(ReadHints):
-    """Hints that ``--hint`` accepts: those of :class:`ReadHints`, and how the file stores opacity."""
+    """Hints that ``--hint`` accepts: the fields of :class:`ReadHints`, and how the file stores opacity."""
 
     opacity: OpacityChoice = setting("auto", "How the file stores opacity: logit, or raw for values in [0, 1]; auto "
         "decides by the values.")  # fmt: skip

@@ -104,7 +104,7 @@ class Setting:
         return join_words([*texts, *map(str, self.words)])
 
     def _describe_range(self, kind: type) -> str:
-        """Describe the possible numbers in a text, such as "a whole number from 1 to 8"."""
+        """Describe the possible numbers in words, such as "a whole number from 1 to 8"."""
         low = f"above {_number(self.above)}" if self.least is None else _number(self.least)
         high = f"below {_number(self.below)}" if self.most is None else _number(self.most)
         if self.least is None and self.above is None:
@@ -177,7 +177,7 @@ def settings_of(options: type) -> dict[str, Setting]:
 
 @cache
 def flat_settings(options: type) -> dict[str, Setting]:
-    """Return the declarations of all settings that users can give, also of those in groups, by flat name."""
+    """Return the declarations of all settings that users can give, also of settings in groups, by flat name."""
     flat: dict[str, Setting] = {}
     for name, declared in settings_of(options).items():
         if not declared.internal:
@@ -186,7 +186,7 @@ def flat_settings(options: type) -> dict[str, Setting]:
 
 
 def change_settings(options: T, values: Mapping[str, Any]) -> T:
-    """Return ``options`` with new values of some settings, also of those in groups, by flat name."""
+    """Return ``options`` with new values of some settings, also of settings in groups, by flat name."""
     changes: dict[str, Any] = {}
     for name, declared in settings_of(type(options)).items():
         names = flat_settings(declared.kind) if declared.is_group and not declared.internal else {name}
@@ -214,7 +214,7 @@ def suggest_name(word: Any, names: Iterable[Any]) -> str:
 
 
 def _types(kind: Any) -> list[Any]:
-    """Return the possible types of a value, or those of the elements if ``kind`` is a list."""
+    """Return the possible types of a value or, if ``kind`` is a list, of its elements."""
     if get_origin(kind) in (Union, UnionType):
         return [inner for member in get_args(kind) for inner in _types(member)]
     return _types(get_args(kind)[0]) if get_origin(kind) is tuple else [kind]

@@ -112,7 +112,7 @@ class MatchOptions(Settings):
 
     @property
     def num_neighbors(self) -> int:
-        """With how many nearest neighbours in other views each Feature Gaussian is compared."""
+        """Number of nearest neighbours in other views with which each Feature Gaussian is compared."""
         return self.neighbors or MATCH_NEIGHBORS["aabb" if self.match == "aabb" else "overlap"]
 
 

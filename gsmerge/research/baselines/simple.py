@@ -29,10 +29,11 @@ def unmerged(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
 
 
 def unmerged_fit(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
-    """Run the full fit on the unmerged input, with as many steps or as much time as gsmerge's own fit has.
+    """Run the full fit on the unmerged input, with the same number of steps, or the same time, as the fit of a gsmerge
+    run.
 
-    The result shows what the fit gains without a merge. The fit replaces Gaussians that no photo shows by new ones, so
-    the number of Gaussians stays. ``count`` is ignored.
+    The result shows what the fit gains without a merge. The fit replaces Gaussians that no photo shows by new
+    Gaussians, so their number stays. ``count`` is ignored.
     """
     gaussians = prepared.scene.file_gaussians
     start, options = Decoded(gaussians, len(gaussians), exact=False), replace(plan.fit, fit="full")
@@ -80,9 +81,9 @@ def match_moments(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
 def splat_transform(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
     """Merge with the program splat-transform of PlayCanvas, which must be installed.
 
-    The program runs on the CPU with the option ``-d COUNT`` and its defaults. The input is returned if it has at most
-    ``count`` Gaussians. Nothing is downloaded. The measured time includes the start of the program, but not the
-    transfer of Gaussians.
+    The program runs on the CPU, with the option ``-d COUNT`` and otherwise default options. The input is returned if it
+    has at most ``count`` Gaussians. Nothing is downloaded. The measured time includes the start of the program, but not
+    the transfer of Gaussians.
     """
     gaussians = prepared.scene.file_gaussians
     if len(gaussians) <= count:

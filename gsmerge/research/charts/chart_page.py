@@ -43,7 +43,7 @@ def make_chart_page(
 
 
 def list_held_out_notes(records: Sequence[RunRecord]) -> list[str]:
-    """List a note for each scene without targets, with the names of the photos that were held out of its runs."""
+    """For each scene without targets, list the photos that were held out of its runs."""
     notes = (f"{record.scene}: {note}" for record in records for note in record.notes if note.startswith(HELD_OUT_NOTE))
     return list(dict.fromkeys(notes))
 

@@ -23,7 +23,7 @@ from gsmerge.research.charts.measure_run import INPUT
 PANEL_WIDTH, SINGLE_WIDTH, PANEL_HEIGHT = 2.9, 4.4, 2.5  # inches: one of several panels, the only panel
 # The first six colours are those of Okabe and Ito (2008)
 LINE_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7B4173", "#8C6D31")
-MARKERS = "osD^vPX"  # 7 markers and 8 colours, so each pair of both comes once in 56 lines
+MARKERS = "osD^vPX"  # 7 markers and 8 colours, so 56 lines have different pairs of marker and colour
 DASHES: tuple[Any, ...] = ("-", (0, (4, 1.5)), (0, (1, 1.2)))  # the first 8 lines have the first dash, and so on
 RC: dict[Any, Any] = {
     "axes.axisbelow": True,

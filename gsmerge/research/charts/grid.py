@@ -1,4 +1,4 @@
-"""Make the runs of a grid of settings. Every combination of the listed values runs on every scene."""
+"""Make the runs of a grid of settings. Every combination of the listed values is run on every scene."""
 
 from __future__ import annotations
 
@@ -83,11 +83,11 @@ def options_of(method: str, settings: Mapping[str, Any]) -> CompactOptions:
 
 
 def find_sources(arguments: Sequence[str], out: Path, targets: str | None = None) -> list[ChartScene]:
-    """Find scenes as ``gsmerge batch`` does, and hash the files of each, so that finished runs can be recognised.
+    """Find scenes as ``gsmerge batch`` does, and hash the files of each scene, so that finished runs can be recognised.
 
-    ``targets`` are the cameras of held-out views: one path for all scenes, or a template with ``{scene}`` (as given),
-    ``{parent}`` (its folder) and ``{stem}`` (its name without extension). Raises SceneError if a file is missing, and
-    UsageError if a template has another name.
+    ``targets`` are the cameras of held-out views: one path for all scenes, or a template with ``{scene}`` (the path as
+    given), ``{parent}`` (the scene's folder) and ``{stem}`` (the scene's name without extension). Raises SceneError if
+    a file is missing, and UsageError if a template has another name.
     """
     scenes = list({main_file(scene).resolve(): scene for scene in find_scenes(arguments, out)}.values())
     sources = []

@@ -58,7 +58,7 @@ class Interval:
 
 @dataclass(frozen=True)
 class Point:
-    """Values of one method at one size over all scenes."""
+    """The results of one method at one size (budget or superpixels), over all scenes."""
 
     label: str  # size
     x: float  # geometric mean of the cost over the scenes
@@ -93,9 +93,9 @@ def mean_interval(values: Sequence[float]) -> Interval:
 def paired_intervals(values: NDArray[np.float64]) -> list[Interval]:
     """Compute a mean and a confidence interval for each column of ``values [scenes,conditions]``.
 
-    Scenes differ by several dB, but conditions by tenths, so plain intervals would hide the effect of conditions.
-    Therefore the mean of every scene is subtracted first (Cousineau 2005), and a factor corrects the intervals for the
-    subtraction (Morey 2008).
+    Scenes differ by several dB, but conditions only by tenths of a dB, so usual intervals would hide the effect of
+    conditions. Therefore the mean of every scene is subtracted first (Cousineau 2005), and a factor corrects the
+    intervals for the subtraction (Morey 2008).
     """
     num_scenes, num_conditions = values.shape
     if num_conditions == 1 or num_scenes == 1:
@@ -126,7 +126,7 @@ def size_label(record: RunRecord) -> str:
 def line_names(keys: Sequence[LineKey]) -> dict[LineKey, str]:
     """Name every line by its method, and by the settings in which the lines of the method differ from each other.
 
-    If a method has one line only, all settings are named.
+    If a method has only one line, its name has all settings.
     """
     names = {}
     for method, settings in keys:
@@ -146,8 +146,8 @@ class Results:
     Attributes:
         runs: The runs.
         names: Name of each line in figures.
-        part: Views and pixels of the scores, a key of ``PARTS``. The chosen key is the first that has scores of nine of
-            ten runs.
+        part: Views and pixels of the scores, a key of ``PARTS``. The first key with scores of nine of ten runs is
+            chosen.
         metrics: Names of the scores: PSNR, SSIM, and LPIPS of one network, preferably VGG.
     """
 
@@ -168,7 +168,7 @@ class Results:
 
     @property
     def caveat(self) -> str:
-        """Warning with which captions begin if no view was held out; empty otherwise."""
+        """Warning at the start of captions if no view was held out; empty otherwise."""
         return "" if self.part.startswith("target") else "No view was held out: fits have seen these. "
 
     def name(self, record: RunRecord) -> str:
@@ -176,7 +176,7 @@ class Results:
         return self.names[line_key(record)]
 
     def by_size(self, x: str, y: str) -> list[Line]:
-        """Make lines of value ``y`` against value ``x``, one point per size."""
+        """Make lines of the score ``y`` against the cost ``x``, one point per size."""
         return make_lines([r for r in self.runs if r.method != INPUT], x, y)
 
     def input_mean(self, name: str, scenes: Iterable[str]) -> float | None:
@@ -216,7 +216,7 @@ def keep_common(scenes_of: Mapping[K, set[str]]) -> dict[K, set[str]]:
     """Choose over which scenes the points of a figure are averaged: if possible, over the same scenes for all points.
 
     ``scenes_of`` are the measured scenes of each point. First, points with less than ``MIN_SHARE`` of all scenes are
-    left out, so that failed runs of one setting do not remove scenes of the others. If the remaining points have no
+    left out, so that failed runs of one setting do not remove scenes from other points. If the remaining points have no
     scene in common, each point keeps its own scenes.
     """
     fewest = MIN_SHARE * len(set().union(*scenes_of.values()))
@@ -228,7 +228,7 @@ def keep_common(scenes_of: Mapping[K, set[str]]) -> dict[K, set[str]]:
 def _point_intervals(columns: Sequence[ByScene]) -> list[Interval]:
     """Compute the mean score of each point over its scenes, with a confidence interval for comparing the points.
 
-    The intervals are those of :func:`paired_intervals`. If points differ in their scenes, intervals have the width 0.
+    The intervals come from :func:`paired_intervals`. If points differ in their scenes, intervals have the width 0.
     """
     if columns and all(column.keys() == columns[0].keys() for column in columns):
         values = [[column[scene][1] for column in columns] for scene in sorted(columns[0])]

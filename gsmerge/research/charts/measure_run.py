@@ -85,7 +85,7 @@ def read_runs(folder: Path) -> list[RunRecord]:
 def run_setting(source: ChartScene, record: RunRecord, options: CompactOptions, measured: EvaluateOptions) -> RunRecord:
     """Merge a scene, measure the result, and return the completed record.
 
-    ``record`` names the scene, the method and the settings. With the method ``INPUT`` the scene itself is measured.
+    ``record`` names the scene, the method and the settings. If the method is ``INPUT``, the scene itself is measured.
     """
     scene, held_out, notes = load_source(source)
     if record.method == INPUT:
@@ -109,7 +109,7 @@ def run_setting(source: ChartScene, record: RunRecord, options: CompactOptions, 
 def load_source(source: ChartScene) -> tuple[Scene, HeldOutViews | None, tuple[str, ...]]:
     """Return a scene, its held-out views, and notes; all three are cached, since the next run often has the same scene.
 
-    Held-out views are those of ``source.targets``. Without targets, some views are taken out of the scene.
+    The held-out views are read from ``source.targets``. Without targets, some views are taken out of the scene.
     """
     load = load_files(find_scene_files(source.path))
     if source.targets is not None:
@@ -120,7 +120,7 @@ def load_source(source: ChartScene) -> tuple[Scene, HeldOutViews | None, tuple[s
 
 
 def hold_out(scene: Scene) -> tuple[Scene, HeldOutViews | None]:
-    """Hold out some photos of a scene to score its results on; return the other views, and the held-out ones.
+    """Hold out some photos of a scene to score its results on; return the scene without them, and the held-out views.
 
     A scene with fewer than four photos keeps all of them.
     """

@@ -40,7 +40,7 @@ def stress(args: opt.Args) -> None:
 
     settings, places = args.make(CompactOptions, StressFiles)
     paths = {name: None if path is None else Path(path) for name, path in vars(places).items()}
-    # ``args.files`` and ``args.load`` take these from options that other commands have
+    # ``args.files`` and ``args.load`` read these attributes, which other commands set by options
     args.cameras, args.images = (None if p is None else opt.named_or_none(p) for p in (places.cameras, places.images))
     args.hint = None
     load = args.load(args.files(args.scene))

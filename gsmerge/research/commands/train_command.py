@@ -71,7 +71,7 @@ def train(args: opt.Args) -> None:
 def find_training_scenes(paths: Sequence[Path], out: Path, validation_scenes: Collection[Path] = ()) -> list[Path]:
     """Find the scenes in files and folders, each once; skip the output folder ``out``.
 
-    A scene of ``validation_scenes`` is left out, unless it is itself one of ``paths``. Raises SceneError if a path does
+    A scene of ``validation_scenes`` is left out, unless ``paths`` name it. Raises SceneError if a path does
     not exist or has no scene, and UsageError if no scene is left.
     """
     from gsmerge.batch.find import find_scenes

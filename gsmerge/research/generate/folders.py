@@ -67,7 +67,7 @@ def generate(
     """Generate scenes ``out/scene_0000`` and so on, all different; the same arguments give the same bytes.
 
     Every folder gets ``scene.ply``, ``transforms.json``, ``images/``, held-out views in ``targets/``, and
-    ``generated.json`` with the random settings. A folder with the same scene is not changed, so that an interrupted
+    ``generated.json`` with the random settings. A folder with the same scene is not changed. Therefore an interrupted
     call can be repeated, and a call with a larger ``count`` adds scenes. Random numbers depend only on ``seed`` and the
     scene's number. ``progress`` is called with the number of finished scenes and the number of all scenes.
 

@@ -26,7 +26,7 @@ LOG_UNIFORM = ("view_bias", "drift", "grain", "turn", "shift", "unit")  # values
 
 @dataclass(frozen=True)
 class NoiseOptions:
-    """Ranges from which the values of each scene are drawn: errors of a network, and habits of its exporter.
+    """Ranges from which each scene's values are drawn: sizes of a network's errors, and habits of its exporter.
 
     Depth errors are standard deviations of the logarithm of depth. These standard deviations are about equal to
     relative errors of depth. docs/internals/lab.md compares the ranges with real exports.

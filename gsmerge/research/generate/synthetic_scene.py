@@ -126,7 +126,7 @@ class _PhotoSession:
     """A lit room with the poses of cameras, and the settings of its photos and of the simulated network."""
 
     lit: LitRoom
-    poses: list[Array]  # camera to world, in metres, along the path: views at even indices, held-out views at odd ones
+    poses: list[Array]  # camera to world, in metres, along the path: even indices: views, odd indices: held-out views
     to_export: Array  # [4,4] world of the room -> world of the exporter, without its unit
     lens: Pinhole  # camera of the views
     photo_lens: Pinhole  # camera of the photos
@@ -146,7 +146,7 @@ class _PhotoSession:
     def predict(self, place: int, photo: Float, deviation: Array, seed: int) -> tuple[Array, Gaussians]:
         """Simulate the network for the photo of a place on the path.
 
-        Return the pose and the Gaussians that it estimates.
+        Return the pose and the Gaussians that the network would estimate.
         ``deviation [2,3]`` is the random error of the pose, see :func:`_perturb_pose`.
         """
         hits = trace(self.lit.shapes, self.poses[place], self.lens, 1)
@@ -168,7 +168,7 @@ def make_synthetic_scene(seed: int, index: int, options: GenerateOptions) -> Syn
     session = _plan_session(rng, options)
     num_places = len(session.poses)
     photo_seeds = rng.integers(0, 2**63, num_places)
-    # Half of the scenes have the first camera at the origin, as many exporters write them
+    # Half of the scenes have the first camera at the origin, as the files of many exporters do
     session = replace(session, to_export=invert_motion(session.poses[0]) if rng.random() < 0.5 else np.eye(4))
     views, targets = range(0, num_places, 2), range(1, num_places, 2)
     errors = {view: (rng.normal(0, 1, (2, 3)), int(rng.integers(2**63))) for view in views}  # deviation and seed
@@ -207,8 +207,8 @@ def _plan_session(rng: np.random.Generator, options: GenerateOptions) -> _PhotoS
 
 
 def _shrink_lens(lens: Pinhole) -> Pinhole:
-    """Return a smaller camera for previews, which show if views are usable, and how bright views are."""
-    divisor = 8  # the sides of previews are those of views divided by this
+    """Return a smaller camera for previews, which show whether views are usable, and how bright they are."""
+    divisor = 8  # the sides of a preview are the sides of a view divided by this
     return Pinhole(max(8, lens.width // divisor), max(8, lens.height // divisor), lens.focal / divisor)
 
 
@@ -245,8 +245,8 @@ def _take_photo(lit: LitRoom, pose: Array, lens: Pinhole, noise: Noise, gain: fl
 def _perturb_pose(pose: Array, noise: Noise, depth: float, deviation: Array) -> Array:
     """Add the network's error to a pose, for a median ``depth``.
 
-    ``deviation [2,3]`` has standard normal numbers for rotation and position. These numbers are multiplied by the sizes
-    of the errors, ``noise.turn`` and ``noise.shift``.
+    ``deviation [2,3]`` has standard normal numbers for rotation and position. These numbers are multiplied by
+    ``noise.turn`` and ``noise.shift``, the sizes of the errors.
     """
     rotation = np.deg2rad(noise.turn) * deviation[0] / 3**0.5
     angle = np.sqrt((rotation * rotation).sum())

@@ -33,9 +33,9 @@ def draw_octaves(
     """Draw noise as a sum of octaves.
 
     Each octave has half the cell size and ``fade`` times the strength of the octave before.
-    A ``fade`` of 0.3 gives clouds, and one of 0.9 gives grit. ``first`` is the number of cells of the coarsest octave
-    along a side. ``stretch`` is the ratio of a cell's length to its height. Noise that is ``ridged`` has sharp crests,
-    as in rock and bark.
+    A ``fade`` of 0.3 gives clouds, and a ``fade`` of 0.9 gives grit. ``first`` is the number of cells of the coarsest
+    octave along a side. ``stretch`` is the ratio of a cell's length to its height. Noise that is ``ridged`` has sharp
+    crests, as in rock and bark.
     """
     out, strength, cells = np.zeros((size, size), np.float32), 1.0, min(first, size // 2)
     while cells <= size // 2:
@@ -130,7 +130,7 @@ def draw_color(
 ) -> Color:
     """Draw a random colour from ranges of hue (0 to 1), saturation (``strength``) and value (``light``).
 
-    Without a range of hues, half of the colours are warm and the others have any hue.
+    Without a range of hues, half of the colours are warm, and the other half has any hue.
     """
     h = (rng.normal(0.08, 0.06) % 1 if rng.random() < 0.5 else rng.random()) if hue is None else rng.uniform(*hue) % 1
     s, v = strength[0] + (strength[1] - strength[0]) * rng.random() ** 1.5, rng.uniform(*light)

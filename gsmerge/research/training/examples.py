@@ -1,7 +1,7 @@
 """Make training examples: the Feature Gaussians of a scene's superpixels before any network, and the photos.
 
 The networks get some of the scene's views. The photos of all other views, and held-out photos, are novel views. An
-example has fixed views, or a window gets random ones of them (:func:`draw_random_views`).
+example has fixed views, of which a window may get a random choice (:func:`draw_random_views`).
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class ColorMap:
 
 @dataclass(frozen=True, eq=False)
 class Example:
-    """A scene for training, or a subset of its views."""
+    """A scene for training, or some of its views."""
 
     name: str  # name of the scene
     unit: float  # unit of length of the scene, the median depth of the Feature Gaussians, in canonical units
@@ -64,7 +64,7 @@ class Example:
     cameras: Cameras  # cameras of these v views
     features: FeatureGaussians  # g analytic Feature Gaussians before merging
     base: Gaussians  # g Gaussians, one for each Feature Gaussian
-    photos: Photos  # p photos without colours: first those of the views, then those of novel views
+    photos: Photos  # p photos without colours: first the photos of the views, then the photos of novel views
     images: np.ndarray  # [p,h,w,3] uint8, colours of the photos, sRGB
     covers: np.ndarray  # [v,p,h,w] uint8: coverage of photos by the Gaussians of each view, see scenes.coverage
     colors: ColorMap = ColorMap()  # change of the photos' colours; ``images`` are unchanged

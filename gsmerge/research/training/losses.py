@@ -3,8 +3,8 @@
 All Feature Gaussians that reach into a window of a photo run through all networks, and the window is rendered from them
 (paper section 4.6). Pixels that the scene does not cover have no loss, so networks need not guess them. LPIPS has the
 values of :mod:`gsmerge.measure.lpips`, and torch can differentiate it. Two regularizers act in early training. One
-regularizer penalises Gaussians that are far from the moments of their groups, which are the paper's teacher. The other
-regularizer penalises children of one group that lie upon each other.
+penalises Gaussians that are far from the moments of their groups (the "teacher" of the paper). The other penalises
+children of one group that lie upon each other.
 """
 
 from __future__ import annotations
@@ -77,8 +77,9 @@ def window_loss(
 ) -> Tensor:
     """Compute the loss of a window: the difference between its render and the photo, plus regularizers.
 
-    The render has a random background. If all levels are trained jointly, the loss is the mean over the levels. The
-    weight of the diversity loss is relative to the photometric loss, because the diversity loss has no natural scale.
+    The render has a random background. If all levels (values of K) are trained jointly, the loss is the mean over the
+    levels. The weight of the diversity loss is relative to the photometric loss, because the diversity loss has no
+    natural scale.
     """
     crop, background = window.crop, rng.random(3, dtype=np.float32)
     levels = options.levels if options.joint else (crop.k,)
@@ -157,7 +158,7 @@ def teacher_loss(prediction: Prediction, members: Members) -> Tensor:
     The teacher of a group is one Gaussian with the opacity-weighted mean and covariance of its members' means
     (equations teacher_mean and teacher_cov), the members' mean colour, and the opacity that conserves the members'
     optical depth. The loss is the angle between the rotations plus L1 distances of means, logarithms of scales,
-    opacities and base colours. The unit of the distance of means is the teacher's size. A Gaussian has 24 equivalent
+    opacities and base colours. Distances between means are in units of the teacher's size. A Gaussian has 24 equivalent
     pairs of rotation and scales, of which the pair nearest to the prediction is used.
     """
     g, merged = prediction.gaussians, prediction.merged
@@ -201,10 +202,10 @@ GEOMETRY_WEIGHT, OPACITY_WEIGHT = 0.75, 0.25  # weights of the two terms of dive
 def diversity_loss(gaussians: Gaussians, parents: Tensor, sizes: Tensor) -> Tensor:
     """Penalise siblings that overlap too much or too little, or differ in opacity (paper supplement D), from 0 to 1.
 
-    Siblings are children of one group. ``parents [n]`` of the children are ascending. The result is a mean over pairs
-    of siblings, weighted by their volumes in units of the ``sizes [n]`` of their groups. The weights have no gradient,
-    since a gradient would make siblings small. With volumes in world units, as in the paper, the loss of a million
-    small Gaussians would be almost 0.
+    Siblings are children of the same group. ``parents [n]`` of the children are ascending. The result is a mean over
+    pairs of siblings, weighted by their volumes in units of the ``sizes [n]`` of their groups. The weights have no
+    gradient, since a gradient would make siblings small. With volumes in world units, as in the paper, the loss of a
+    million small Gaussians would be almost 0.
     """
     left, right = sibling_pairs(parents)
     if len(left) == 0:

@@ -1,7 +1,7 @@
 """Encoder, decoder heads, merger and refiner as torch modules, for training (paper sections 4.2 to 4.5).
 
-All networks take tokens, and return raw corrections of what the closed formulas of the stages compute (fig.
-architecture). The last layers start at zero, so untrained networks change nothing.
+All networks take tokens. The stages compute results by closed formulas, and the networks return raw corrections of
+these results (fig. architecture). The last layers start at zero, so untrained networks change nothing.
 
 All networks are built from the blocks of the Set Transformer (Lee et al. 2019). Sets are padded to one size. ``mask``
 is True for tokens of the set and False for padding, which gets no attention.
@@ -113,7 +113,7 @@ class Pooling(nn.Module):
 
 
 class SetNetwork(nn.Module):
-    """The layers that encoder and merger share.
+    """Layers of the kind that both the encoder and the merger have.
 
     Tokens pass through an MLP, attention blocks and pooling. The result is joined with the group's numbers in an MLP.
     """

@@ -276,8 +276,8 @@ class TrainingContext(NetworkContext):
     ) -> Array:
         """Make tokens.
 
-        Tokens are tensors for Gaussians, and arrays for members, since no network changes members. The arguments are
-        those of :func:`gsmerge.networks.tokens.part_tokens`.
+        Tokens of Gaussians are tensors, but tokens of members are arrays, since no network changes members. The
+        arguments are those of :func:`gsmerge.networks.tokens.part_tokens`.
         """
         if isinstance(parts, Gaussians):
             return differentiate_tokens(parts, ids, owners, group_features)
@@ -339,9 +339,8 @@ def refine_crop(crop: Crop, networks: Networks, options: TrainOptions, seed: int
 def decode_crop(refined: RefinedCrop, crop: Crop, k: int) -> Prediction:
     """Decode every Feature Gaussian of a crop into ``k`` children, and correct them by the heads, with gradients.
 
-    If ``k`` is more than 1, the closed formulas make the children from the members, without a gradient. In this case
-    earlier stages get gradients only through the inputs of the heads. Heads with "absolute" outputs make the children
-    themselves.
+    If ``k`` is more than 1, the closed formulas make the children from the members, without a gradient. Earlier stages
+    then get gradients only through the inputs of the heads. Heads with "absolute" outputs make the children themselves.
     """
     described, context = refined.described, refined.context
     arrays = features_to_arrays(described.features)
@@ -372,7 +371,8 @@ def _make_children(
     """Make ``k`` children of every Feature Gaussian, by closed formulas.
 
     Return the children, and their parents ``[n]``.
-    Parents are rows of Feature Gaussians, ascending. The children are None if the heads make them themselves.
+    Parents are rows of Feature Gaussians, ascending. If the heads make the children, None is returned in place of
+    children.
     """
     if context.makes_children:
         return None, np.repeat(np.arange(len(arrays)), k)

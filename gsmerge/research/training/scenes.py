@@ -24,8 +24,8 @@ class TrainingScene:
 
     scene: Scene  # the chosen views
     members: Members  # the Gaussians of these views
-    cameras: Cameras  # cameras of all photos, those of the chosen views first
-    images: np.ndarray  # [p,h,w,3] float32 photos, at the size of the scene's own
+    cameras: Cameras  # cameras of all photos; the cameras of the chosen views are first
+    images: np.ndarray  # [p,h,w,3] float32 photos, at the size of the scene's photos
 
     def photos(self, level: float = 1) -> Photos:
         """Return all photos with sides divided by ``level``."""
@@ -44,7 +44,7 @@ def view_subsets(num_views: int, counts: Sequence[int]) -> list[list[int]]:
 def make_training_scene(scene: Scene, ids: Sequence[int], held_out: Views | None = None) -> TrainingScene:
     """Prepare the views ``ids`` of an aligned scene for training, with all photos of the scene.
 
-    Photos of ``held_out`` views are added, resized to the size of the scene's own.
+    Photos of ``held_out`` views are added, resized to the size of the scene's photos.
     """
     assert scene.images is not None
     part = subset(scene, ids)

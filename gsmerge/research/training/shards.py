@@ -33,7 +33,7 @@ from gsmerge.version import __version__
 LAYOUT = 7  # version of the files and their contents
 EXAMPLE_FORMAT = "gsmerge-example"
 EXAMPLE_REMEDY = "remove it; the next call makes it again"
-# Settings of which an example is made, besides its views
+# Settings that decide an example, besides its views
 EXAMPLE_SETTINGS = ("densities", "segmentation", "photo_scale", "photo_side", "seed")
 STORED_PARTS = {"members": Members, "features": FeatureGaussians, "base": Gaussians}  # all their fields are arrays
 
@@ -67,7 +67,7 @@ def prepare_shards(
 
 
 def _scene_shards(scene: Path, options: TrainOptions, folder: Path) -> list[Shard]:
-    """Return the shards of one scene; make them and their record if there is no complete record."""
+    """Return the shards of one scene; first make the shards and their record if there is no complete record."""
     key, name = scene_key(scene, options), example_name(scene)
     record = folder / f"{key[:32]}.json"
     hashes = _read_hashes(record)
@@ -82,7 +82,7 @@ def _scene_shards(scene: Path, options: TrainOptions, folder: Path) -> list[Shar
 
 
 def scene_key(scene: Path, options: TrainOptions) -> str:
-    """Return a hash of a scene's files, and of the settings of which its examples are made.
+    """Return a hash of a scene's files, and of the settings that decide its examples.
 
     Raises SceneError if there is no scene.
     """
@@ -90,7 +90,7 @@ def scene_key(scene: Path, options: TrainOptions) -> str:
     head |= {name: getattr(options, name) for name in EXAMPLE_SETTINGS}
     files = find_scene_files(scene)
     targets = files.ply.parent / "targets"
-    # Held-out photos get a hash of their own, because a hash contains names relative to one folder
+    # Held-out photos get a separate hash, because a hash contains names relative to one folder
     held_out = content_hash([targets]) if targets.is_dir() else None
     return digest({**head, "content": content_hash(list_files(files)), "held_out": held_out})
 

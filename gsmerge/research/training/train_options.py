@@ -98,7 +98,7 @@ class TrainOptions(Settings):
 
     @property
     def example_views(self) -> tuple[int, ...]:
-        """Numbers of views: each scene gives an example for each number; 0 stands for all views."""
+        """Numbers of views. Each scene gives one example for each of these numbers; 0 stands for all views."""
         return (0,) if self.random_views else self.views
 
     def match_options(self) -> MatchOptions:
@@ -136,7 +136,7 @@ class TrainOptions(Settings):
         return asdict(self) | {name: list(getattr(self, name)) for name in LIST_OPTIONS}
 
 
-# The paper's hyperparameters: its table, and sections 4.1, 4.4 and 5.1. Settings that the paper does not state have
+# Hyperparameters from the paper's table and its sections 4.1, 4.4 and 5.1. Settings that the paper does not state have
 # their defaults, except for the densities.
 PAPER: Mapping[str, Any] = {
     "outputs": "absolute",

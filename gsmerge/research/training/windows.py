@@ -1,4 +1,4 @@
-"""Sample the parts of examples that a step uses: windows of photos, and the Feature Gaussians in them."""
+"""Sample what a training step uses of its examples: windows of photos, and the Feature Gaussians in these windows."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class Window:
 
     photo: int  # number of the photo in the example
     box: Box  # the rectangle
-    crop: Crop  # all Feature Gaussians that reach into it
+    crop: Crop  # all Feature Gaussians that reach into the rectangle
 
     @property
     def camera(self) -> Cameras:
@@ -118,7 +118,7 @@ def _choose_photo(example: Example, novel: float, rng: np.random.Generator) -> t
 
 
 def _reaching_rows(example: Example, photo: int, box: Box) -> np.ndarray:
-    """Return the rows of the Feature Gaussians that reach into a box of a photo, or may after corrections."""
+    """Return the rows of the Feature Gaussians that reach into a box of a photo, or may do so after corrections."""
     border = 4  # width, in pixels, of the frame around the box from which corrections may move Gaussians into it
     wide = Box(box.left - border, box.top - border, box.width + 2 * border, box.height + 2 * border)
     tiled = tile_view(
