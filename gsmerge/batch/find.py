@@ -160,7 +160,7 @@ class _Search:
                 subfolders.clear()  # os.walk enters none of them
                 continue
             self.seen.add(real_path)
-            is_scene = _is_scene(folder, names)
+            is_scene = _is_scene_folder(folder, names)
             subfolders[:] = natural_order(
                 name for name in subfolders if not name.startswith(".") and not (is_scene and name in SCENE_PARTS)
             )
@@ -207,7 +207,7 @@ def _other_scenes(folder: Path, names: list[str]) -> list[Path]:
     return [folder]
 
 
-def _is_scene(folder: Path, names: list[str]) -> bool:
+def _is_scene_folder(folder: Path, names: list[str]) -> bool:
     """Return whether a folder is a scene; ``names`` are the names of the files and folders in it."""
     try:
         if SCENE_NAMES.isdisjoint(names):

@@ -157,7 +157,7 @@ def align(
         shape_error = error
     recovery = next(filter(None, (_recover_pixels(source, grid) for grid in grids)), None)
     if recovery is not None:
-        return _make_result(source, recovery)
+        return _make_alignment(source, recovery)
     if shape_error is not None and not grids:
         raise shape_error
     try:
@@ -336,7 +336,7 @@ def _align_without_pixels(source: RowSource, grid: Grid, frames: Callable[[], Se
     if place.frame is not IDENTITY:
         recovery = None if source.order == "none" else _follow_order(source, grid, [place.frame])
         if recovery is not None:  # the rows alone did not show their scale, but the photos did
-            return _make_result(source, recovery)
+            return _make_alignment(source, recovery)
         camera_file = replace(camera_file, viewmats=cameras.viewmats)
     notes = (*place.notes(source.camera_file.convention), *notes_on_choice)
     return AlignmentResult(
@@ -351,7 +351,7 @@ def _align_without_pixels(source: RowSource, grid: Grid, frames: Callable[[], Se
     )
 
 
-def _make_result(source: RowSource, recovery: Recovery) -> AlignmentResult:
+def _make_alignment(source: RowSource, recovery: Recovery) -> AlignmentResult:
     """Make the result for rows that are pixels, with cameras and poses in the frame of the Gaussians."""
     place, grid, camera_file = recovery.place, recovery.place.grid, source.camera_file
     inputs, notes, confirmed = source.inputs(grid), place.notes(camera_file.convention), grid.confirmed_viewmats

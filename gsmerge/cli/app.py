@@ -119,7 +119,7 @@ def _command_of(words: list[str]) -> str | None:
     return None if entry is None or _is_research(entry) else name
 
 
-def _is_scene(word: str) -> bool:
+def _names_scene(word: str) -> bool:
     """Return whether the first word is a scene instead of a command: an existing path, or the name of a scene file."""
     if word.startswith("-") or _command_of([word]) is not None:
         return False
@@ -241,7 +241,7 @@ def run(args: Sequence[str] | None = None) -> int:
     try:
         with plain_warnings(), _orderly_stop(signals), print_style():
             _check_working_directory()
-            words = [LOOK, *words] if words and _is_scene(words[0]) else words
+            words = [LOOK, *words] if words and _names_scene(words[0]) else words
             words = [*words[1:], "--help"] if words[:1] == ["help"] else words
             command = make_command(_command_of(words))
             code = command(args=words, prog_name=PROGRAM, standalone_mode=False) or 0

@@ -97,7 +97,7 @@ def _compact(
     With ``on_read`` the caller shows the result on a page.
     """
     if isinstance(source, FeatureFile):
-        _decode(args, source.base, out)
+        _decode_features(args, source.base, out)
         return
     hints = args.hints()
     settings, writing, engine = args.make(CompactOptions, FileOptions, Engine)
@@ -196,7 +196,7 @@ def _judge_result(args: opt.Args, document: Mapping[str, Any]) -> None:
         raise TargetError("; ".join(filter(None, problems)))
 
 
-def _decode(args: opt.Args, path: Path, out: Path) -> None:
+def _decode_features(args: opt.Args, path: Path, out: Path) -> None:
     """Decode the Feature Gaussians of a ``.gsm``, and write the result."""
     if len(args.scenes) > 1:
         raise UsageError(f"{path}: expected Feature Gaussians as the only input, got {len(args.scenes)} inputs")

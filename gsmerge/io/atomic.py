@@ -97,7 +97,7 @@ class _Outputs:
         if str(path) in _written:  # the path is a temporary file itself
             return path
         self.new_folders.extend(_make_folder(path.parent))
-        _check_writable(path, self.overwrite)
+        _check_output_is_free(path, self.overwrite)
         target = Path(os.path.realpath(path)) if path.is_symlink() else path
         _remove_stale_once(target.parent.absolute())
         temporary = temporary_path(target)
@@ -294,7 +294,7 @@ def _is_stale(entry: os.DirEntry[str], machine: str, pid: int) -> bool:
         return False
 
 
-def _check_writable(path: Path, overwrite: bool) -> None:
+def _check_output_is_free(path: Path, overwrite: bool) -> None:
     """Raise SceneError if an output cannot be written, or if the output exists and ``overwrite`` is False."""
     try:
         status = os.stat(path)

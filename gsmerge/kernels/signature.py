@@ -138,7 +138,7 @@ def declare(name: str, returns: Argument | None = None, /, **arguments: Argument
     def convert(values: Sequence[Any], sizes: dict[str, int]) -> list[Any]:
         """Check types and shapes, return the arguments for ctypes, and add named sizes to ``sizes``."""
         pairs = zip(arguments.items(), values, strict=True)
-        return [_convert(name, key, argument, value, sizes) for (key, argument), value in pairs]
+        return [_convert_argument(name, key, argument, value, sizes) for (key, argument), value in pairs]
 
     def call(*values: Any, **named: Any) -> Any:
         """Check the arguments, and call the C function of the loaded library."""
@@ -200,7 +200,7 @@ class FilledTable:
 
     def point(self, key: str, array: np.ndarray[Any, Any]) -> None:
         """Let the struct point to another array, or raise ValueError if it has other sizes."""
-        self[key] = _convert(self.table.name, key, self.table.arrays[key], array, self._sizes)
+        self[key] = _convert_argument(self.table.name, key, self.table.arrays[key], array, self._sizes)
         self.arrays[key] = array
 
     def __getitem__(self, key: str) -> int:
@@ -232,7 +232,7 @@ def _entry(library: ctypes.CDLL, name: str, returns: Argument | None, arguments:
     return function
 
 
-def _convert(name: str, key: str, argument: Argument, value: Any, sizes: dict[str, int]) -> Any:
+def _convert_argument(name: str, key: str, argument: Argument, value: Any, sizes: dict[str, int]) -> Any:
     """Check the type and the shape of one argument, and return the value or the address to pass.
 
     Named sizes that are not known yet are added to ``sizes``.

@@ -112,7 +112,7 @@ def lpips(image: Array, reference: Array, net: str = "vgg", mask: Array | None =
     small = values.shape[0] * values.shape[1] <= MAX_CACHED_PIXELS
     compute = _cached_features if small else _cached_features.__wrapped__
     features = compute(values.tobytes(), values.shape, path, net)
-    return _sum_differences(_unit_features(first.astype(np.float32), layers), features, layers)
+    return _sum_differences(_normalise_features(first.astype(np.float32), layers), features, layers)
 
 
 def lpips_available(net: str = "vgg") -> bool:
@@ -168,10 +168,10 @@ def _sum_differences(
 @lru_cache(maxsize=MAX_CACHED)  # successive calls often have the same reference, for one network or both
 def _cached_features(reference: bytes, shape: tuple[int, ...], path: Path, net: str) -> list[np.ndarray]:
     """Compute and cache the unit features of an image of a ``shape``, whose float32 values a cache takes as bytes."""
-    return list(_unit_features(np.frombuffer(reference, np.float32).reshape(shape), _load_layers(path, net)))
+    return list(_normalise_features(np.frombuffer(reference, np.float32).reshape(shape), _load_layers(path, net)))
 
 
-def _unit_features(image: np.ndarray, layers: tuple[Convolution, ...]) -> Iterator[np.ndarray]:
+def _normalise_features(image: np.ndarray, layers: tuple[Convolution, ...]) -> Iterator[np.ndarray]:
     """Yield the features ``[h,w,c]`` of each compared layer of an image, scaled to unit length at every pixel."""
     features = (2 * image - 1 - INPUT_SHIFT) / INPUT_SCALE
     for layer in layers:
@@ -234,17 +234,17 @@ def _make_layers(tree: Mapping[str, Any], architecture: _Architecture) -> tuple[
     inputs, compared = 3, 0
     for i, conv in enumerate(architecture.convs):
         entry, out = tree[architecture.trunk][f"Conv_{i}"], conv.channels
-        kernel = _check_values(entry["kernel"], (conv.size, conv.size, inputs, out)).transpose(3, 0, 1, 2)
+        kernel = _check_weights(entry["kernel"], (conv.size, conv.size, inputs, out)).transpose(3, 0, 1, 2)
         weights = None
         if conv.compared:
-            weights = _check_values(tree[f"NetLinLayer_{compared}"]["Conv_0"]["kernel"], (1, 1, out, 1)).flatten()
+            weights = _check_weights(tree[f"NetLinLayer_{compared}"]["Conv_0"]["kernel"], (1, 1, out, 1)).flatten()
             compared += 1
-        layers.append(Convolution(conv, np.ascontiguousarray(kernel), _check_values(entry["bias"], (out,)), weights))
+        layers.append(Convolution(conv, np.ascontiguousarray(kernel), _check_weights(entry["bias"], (out,)), weights))
         inputs = out
     return tuple(layers)
 
 
-def _check_values(stored: Any, shape: tuple[int, ...]) -> np.ndarray:
+def _check_weights(stored: Any, shape: tuple[int, ...]) -> np.ndarray:
     """Return ``stored``, or raise ValueError unless it is a float32 array of the ``shape``."""
     if not isinstance(stored, np.ndarray) or stored.shape != shape or stored.dtype != np.float32:
         raise ValueError(f"expected a float32 array of shape {list(shape)}, found something else")

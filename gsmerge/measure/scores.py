@@ -120,7 +120,7 @@ def evaluation_tables(document: Mapping[str, Any]) -> Iterator[TextTable]:
     )
     for split in document["num_views"]:
         yield from _quality_tables(document, split)
-    outside = [(result["name"], *(_format_number(result[name]) for name in OUTSIDE_COLUMNS)) for result in results]
+    outside = [(result["name"], *(_format_score(result[name]) for name in OUTSIDE_COLUMNS)) for result in results]
     heading = "Faults seen from outside that the input does not have: shares of the picture, less is better"
     yield heading, ("", *OUTSIDE_COLUMNS.values()), [row for row in outside if any(row[1:])]
 
@@ -175,10 +175,10 @@ def _format_figures(
 ) -> Iterator[str]:
     """Yield the values ``NAME + suffix`` of a score as text, for each of ``names``; missing values become ""."""
     for name in names:
-        yield _format_number(score[name + suffix], 2 if name == "psnr" else 3)
+        yield _format_score(score[name + suffix], 2 if name == "psnr" else 3)
 
 
-def _format_number(value: float | None, digits: int = 3) -> str:
+def _format_score(value: float | None, digits: int = 3) -> str:
     """Format a number; "" for None."""
     return "" if value is None else f"{value:.{digits}f}"
 

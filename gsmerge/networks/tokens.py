@@ -53,7 +53,7 @@ def describe_features(
     columns = (in_order(getattr(features, name)) for name in ("covars", "masses", "extinctions", "weights"))
     describe_groups(
         base.means, base.scales, base.opacities, base.sh0, *columns, num_members, bare.footprints,
-        bare.frames, bare.sizes, _viewmats(cameras), views, group,
+        bare.frames, bare.sizes, _contiguous_viewmats(cameras), views, group,
     )  # fmt: skip
     group[:, GROUP_COLUMNS - NUM_STATS :] = np.nan_to_num(stats)
     return replace(bare, group=group)
@@ -68,7 +68,7 @@ def make_group_features(
     """
     base = contiguous(feature_to_gaussians(features))
     frames, sizes = np.empty((len(features), 3, 3), np.float32), np.empty(len(features), np.float32)
-    place_frames(base.means, base.scales, _viewmats(cameras), views, frames, sizes)
+    place_frames(base.means, base.scales, _contiguous_viewmats(cameras), views, frames, sizes)
     return GroupFeatures(features, base, frames, sizes, in_order(features.footprints), views, group)
 
 
@@ -82,7 +82,7 @@ def in_order(values: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(values, np.float32)
 
 
-def _viewmats(cameras: Cameras) -> np.ndarray:
+def _contiguous_viewmats(cameras: Cameras) -> np.ndarray:
     return np.ascontiguousarray(as_array(cameras.viewmats), np.float64)
 
 

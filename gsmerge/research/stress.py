@@ -227,10 +227,10 @@ def _compact_and_score(setup: StressScene, options: CompactOptions) -> _ScoredRe
     """Compact a scene, and measure the PSNR of the input and of the result."""
     result = compact(setup.scene, options)
     count = len(result.gaussians) + result.report.choices.get("pruned", 0)
-    return _ScoredResult(result.gaussians, count, *_measure_psnr(setup, result.gaussians))
+    return _ScoredResult(result.gaussians, count, *_measure_all_views(setup, result.gaussians))
 
 
-def _measure_psnr(setup: StressScene, gaussians: Gaussians) -> tuple[float, float]:
+def _measure_all_views(setup: StressScene, gaussians: Gaussians) -> tuple[float, float]:
     """Measure the PSNR (dB) of the input and of a result.
 
     If there are no photos, renders of the input are the reference, and the PSNR of the input is infinite.
@@ -276,7 +276,7 @@ def _check_again(setup: StressScene, base: _ScoredResult, options: CompactOption
     unaligned = Scene(base.gaussians, scene.cameras, scene.images, None, scene.names)
     same_count = BudgetOptions(budget=len(base.gaussians))
     settings = replace(options, budget=same_count, decode=replace(options.decode, k=1))
-    after = _measure_psnr(setup, compact(unaligned, settings).gaussians)[1]
+    after = _measure_all_views(setup, compact(unaligned, settings).gaussians)[1]
     return after >= base.after - MAX_SAME - _fit_slack(options), f"{after:.2f} dB; before {base.after:.2f} dB"
 
 

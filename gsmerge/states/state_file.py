@@ -113,14 +113,14 @@ def _read_features(file: GsmFile) -> FeatureState:
     shapes: dict[str, tuple[int, ...]] = {  # of the columns that have more than one number per group
         "means": (3,), "covars": (3, 3), "sh0": (1, 3), "shN": (num_higher, 3), "latents": (networks.options.latent,),
     }  # fmt: skip
-    columns = {name: _read_numbers(file, f"merged.{name}", g, *shapes.get(name, ())) for name in FEATURE_COLUMNS}
+    columns = {name: _read_bounded_array(file, f"merged.{name}", g, *shapes.get(name, ())) for name in FEATURE_COLUMNS}
     merged = FeatureGaussians(
         **columns,
         views=_read_whole_numbers(file, "merged.views", g, -1, num_views),
         starts=np.zeros(g + 1, np.int64),  # the file stores no members
         members=np.zeros(0, np.int32),
     )
-    corrected = {name: _read_numbers(file, f"refined.{name}", g, *shapes.get(name, ())) for name in CORRECTED}
+    corrected = {name: _read_bounded_array(file, f"refined.{name}", g, *shapes.get(name, ())) for name in CORRECTED}
     return FeatureState(
         merged=merged,
         refined=replace(merged, **corrected),
@@ -128,7 +128,7 @@ def _read_features(file: GsmFile) -> FeatureState:
         views=_read_whole_numbers(file, "views", g, 0, num_views),
         num_members=_read_whole_numbers(file, "num_members", g, 1, _MAX_MEMBERS + 1),
         saliency=file.finite("saliency", np.float64, g),
-        group=_read_numbers(file, "group", g, GROUP_COLUMNS),
+        group=_read_bounded_array(file, "group", g, GROUP_COLUMNS),
         cameras=cameras,
         frame=Frame(file.finite("origin", np.float64, 3), unit),
         networks=networks,
@@ -162,10 +162,10 @@ def _read_samples(file: GsmFile, num_views: int) -> ViewSamples:
         raise file.error("samples.opacities: expected pixels of every view, found none")
     shapes = {"means": (3,), "opacities": (), "sh0": (3,)}
     grid = num_views, height, width
-    return ViewSamples(*(_read_numbers(file, f"samples.{name}", *grid, *shape) for name, shape in shapes.items()))
+    return ViewSamples(*(_read_bounded_array(file, f"samples.{name}", *grid, *shape) for name, shape in shapes.items()))
 
 
-def _read_numbers(file: GsmFile, name: str, *shape: int) -> np.ndarray:
+def _read_bounded_array(file: GsmFile, name: str, *shape: int) -> np.ndarray:
     """Return a float32 array of a file; raise SceneError for numbers so large that sums overflow."""
     array = file.array(name, np.float32, *shape)
     largest = 1e37  # largest absolute value; float32 ends at 3e38

@@ -56,7 +56,7 @@ def join_scenes(scenes: Sequence[Scene], paths: Sequence[Path]) -> JoinedScene:
     ]
     if len({scene.images is None for scene in moved}) > 1:
         notes.append(Doubt("some files have no photos, so none are used; name the folder of all with --images"))
-    facts = map(_describe_scene, paths, registration.similarities, registration.matches)
+    facts = map(_describe_joined, paths, registration.similarities, registration.matches)
     return JoinedScene(concat_scenes(moved), tuple(used), tuple(names), tuple(notes), tuple(facts))
 
 
@@ -81,7 +81,7 @@ def _check_joinable(scenes: Sequence[Scene], paths: Sequence[Path]) -> None:
             raise SceneError(path, problem, "export all with one degree")
 
 
-def _describe_scene(path: Path, similarity: Similarity | None, matches: int) -> dict[str, Any]:
+def _describe_joined(path: Path, similarity: Similarity | None, matches: int) -> dict[str, Any]:
     """Return the facts of a scene in the report, see :class:`JoinedScene`."""
     facts: dict[str, Any] = {"path": str(path), "joined": similarity is not None}
     if similarity is None:

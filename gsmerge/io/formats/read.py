@@ -155,7 +155,7 @@ def read_parts(
         if part.rows.dtype != parts[0].rows.dtype:
             problem = f"expected the same columns as in {paths[0].name}, found others, so these are no parts of a scene"
             raise SceneError(path, problem, "name one of the files")
-    return convert_files(paths, parts, opacity, scales, colors)
+    return convert_stored(paths, parts, opacity, scales, colors)
 
 
 @check_arguments
@@ -182,10 +182,10 @@ def read_gaussians(
         raise SceneError(path, problem, "name the file that it was made from")
     if format_.read is ply.read_rows:
         return read_ply(path, opacity=opacity, scales=scales, colors=colors)
-    return convert_files([path], [format_.read(path)], "auto")
+    return convert_stored([path], [format_.read(path)], "auto")
 
 
-def convert_files(
+def convert_stored(
     paths: Sequence[Path],
     parts: Sequence[StoredRows],
     opacity: OpacityChoice,

@@ -25,7 +25,7 @@ from gsmerge.errors import SceneError, UsageError
 from gsmerge.io.atomic import AddOutput, atomic_outputs
 from gsmerge.io.bounds import ReadBudget, check_file, check_whole, read_json
 from gsmerge.io.formats import arrays, sog
-from gsmerge.io.formats.read import GaussianFile, convert_files
+from gsmerge.io.formats.read import GaussianFile, convert_stored
 from gsmerge.io.formats.splat_transform import blame_program, run_program
 from gsmerge.io.formats.table import INDEX, Contents
 from gsmerge.io.formats.write import write_ply
@@ -244,7 +244,7 @@ def read_rows(path: Path, level: int = 0, index: StreamedIndex | None = None) ->
 
 def read_level(path: Path, level: int, index: StreamedIndex | None = None) -> GaussianFile:
     """Read one level of detail of a ``lod-meta.json``; 0 is the finest. Raise errors as :func:`read_gaussians`."""
-    return convert_files([path], [read_rows(path, level, index)], "auto")
+    return convert_stored([path], [read_rows(path, level, index)], "auto")
 
 
 def _read_chunks(path: Path, chunks: Mapping[Path, int | None]) -> list[sog.SogContent]:
