@@ -190,6 +190,7 @@ def stage_progress(*, quiet: bool) -> Iterator[Progress]:
     if json_lines is not None:
 
         def print_json(text: str, done: int, total: int) -> None:
+            """Print a step of the run as a line of JSON."""
             stage, _, detail = one_line(text).partition(": ")
             json_lines.move(_share_done(text, done, total))
             json_lines.print({"stage": stage, "detail": detail, "done": done, "total": total})
@@ -262,6 +263,7 @@ def total_progress(total: int, *, quiet: bool) -> Iterator[RunProgress]:
         json_lines.move(0.0)
 
         def print_json(end: RunEnd) -> None:
+            """Print the end of a scene of a batch as a line of JSON."""
             say_notes(name_notes(end.name, end.notes))
             json_lines.move(end.share)
             event = {"scene": end.name, "status": end.status, "done": end.done, "total": total}

@@ -95,11 +95,11 @@ def compact_in_blocks(
         shared = work.share(covisibility)
 
         def pieces() -> Iterator[tuple[Any, ...]]:
-            """Yield the arguments of :func:`start_block` for each block."""
+            """Yield the arguments of :func:`start_block` for each block: its part of the scene, and its options."""
             for block, factor in zip(blocks, factors, strict=True):
                 piece_options = block_options(options, scene, block, factor, limit)
                 piece = subset(scene, block.views)
-                free_scene(scene)
+                free_scene(scene)  # its pages can be read again from the file; the piece is a copy
                 yield piece, block, shared, piece_options, frame
 
         expect_parts(block_parts(scene, options, choices, count))

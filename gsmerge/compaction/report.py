@@ -304,7 +304,7 @@ def curve_lines(document: Mapping[str, Any]) -> list[str]:
     ]
     num_photos = document["choices"].get("curve_left_out")
     scored_on = count_words(num_photos, "photo") if num_photos else "patches of the photos"
-    return [f"short fits of half the size compare counts, on {scored_on} that they left out:", head, *rows]
+    return [f"short fits compare counts, on {scored_on} that they left out:", head, *rows]
 
 
 def _scores_on_files(document: Mapping[str, Any]) -> Mapping[str, float] | None:
