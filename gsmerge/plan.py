@@ -1,4 +1,4 @@
-"""The plan of a run: only this module reads "auto", effort, budget, recipe and checkpoint names.
+"""The plan of a run: only this module decides what effort, budget, recipe and names of checkpoints mean.
 
 Every choice is a function here. :func:`make_plan` makes all choices for a prepared scene or block.
 :func:`choose_for_scene` makes only the choices that need no computation, for estimates and for scenes in blocks. Each

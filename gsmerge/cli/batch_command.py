@@ -67,7 +67,7 @@ REASONS = {
     opt.change_option("overwrite", False, help="Compact all scenes again. Also replace files in the folder that were "
                 "not written by a batch with these settings."),
     "strict dry_run seed",
-    opt.change_option("threads", help="Number of threads of each scene.", show_default="processors by jobs"),
+    opt.change_option("threads", help="Number of threads of each scene.", show_default="processors divided by jobs"),
     opt.change_option("json", False, help="Print one line of JSON per scene on stdout."),
 )  # fmt: skip
 def batch(args: opt.Args) -> None:

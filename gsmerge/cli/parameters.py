@@ -73,7 +73,7 @@ class Args(SimpleNamespace):
         return {name: values[name] for name in names if values.get(name) is not None}
 
     def refuse_options(self, allowed: Collection[str], path: Path) -> None:
-        """Raise UsageError if the user gave an option that is not ``allowed`` for Feature Gaussians, as in ``path``."""
+        """Raise UsageError if the user gave an option that is not ``allowed``; ``path`` holds Feature Gaussians."""
         for name, value in self.get_given(OPTIONS).items():
             if value and name not in allowed and value != OPTIONS[name].default:
                 flag = f"--{name.replace('_', '-')}"

@@ -140,15 +140,17 @@ def _write_to(record: Record) -> Iterator[Record]:
 def stage(name: str) -> Iterator[None]:
     """Report the progress of a stage, and record the seconds of the block, or of the decorated function.
 
-    A stage within another stage is neither reported nor recorded, because its time counts for the outer stage. If
-    ``name`` is not one of ``STAGES``, the number of finished stages is reported in place of an index in ``STAGES``.
+    A stage within another stage is neither reported nor recorded, because its time counts for the outer stage. The
+    place of ``name`` in ``STAGES`` is reported. A name that is not there has the place after the last finished stage.
     """
     record = _current.get()
     if record is None or record.running is not None:
         yield
         return
     if name not in record.seconds:  # if a stage continues after a break, this is not a new step
-        report_progress(name, STAGES.index(name) if name in STAGES else len(record.seconds), len(STAGES))
+        finished = [STAGES.index(other) for other in record.seconds if other in STAGES]
+        place = STAGES.index(name) if name in STAGES else max(finished, default=-1) + 1
+        report_progress(name, place, len(STAGES))
     record.running, start = name, time.perf_counter()
     try:
         yield

@@ -72,7 +72,10 @@ def infer_labels(labels, colours, count):
 
 
 def improve_labels(labels, colours, areas):
-    """Fit the regions, and move pixels to the most likely ones in place, with ``areas`` of :func:`fit_regions`."""
+    """Fit the regions, and move pixels to their most likely regions; ``labels`` change in place.
+
+    ``areas [count]`` float64 are the expected areas of the regions in pixels, see :func:`fit_regions`.
+    """
     table = simple_point_table()
     # Number of neighbours with other labels, for each ring of `simple_point_table`
     foreign = 8 - ((np.arange(256)[:, None] >> np.arange(8)) & 1).sum(1).astype(np.float32)

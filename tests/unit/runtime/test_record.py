@@ -57,12 +57,12 @@ def test_a_stage_inside_another_is_part_of_it() -> None:
 def test_a_new_stage_needs_no_list() -> None:
     events: list[tuple[str, int, int]] = []
     with record_run(lambda *event: events.append(event)) as record:
-        with stage("prepare"):
+        with stage("match"):
             pass
         with stage("a new one"):
             pass
-    assert list(record.seconds) == ["prepare", "a new one"]
-    assert events[1] == ("a new one", 1, len(STAGES))
+    assert list(record.seconds) == ["match", "a new one"]
+    assert events[1] == ("a new one", STAGES.index("match") + 1, len(STAGES))
 
 
 def test_failed_stage_ends_before_the_next_begins() -> None:
