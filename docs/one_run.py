@@ -38,8 +38,8 @@ ROW = (VIEW * HEIGHT + Y) * WIDTH + X  # row of this pixel's Gaussian
 LINE = 120  # most characters of a line of the page
 WATCHED = {  # functions that are recorded, by the module that calls them
     "gsmerge.scene.read": ("align",),
-    "gsmerge.compaction.compact": ("make_plan", "make_result"),
-    "gsmerge.pipeline": ("segment_scene", "correct", "match", "merge", "decode_merged", "fit_scene", "prune_and_fill"),
+    "gsmerge.compaction.compact": ("make_plan", "build", "make_result"),
+    "gsmerge.pipeline": ("segment_scene", "correct", "match", "merge", "decode_merged", "fit_scene"),
 }
 ZOOM, STRIP, GAP = 4, 22, 6  # enlargement of photos, height of a title, and gap between panels, pixels
 DARK, BORDER = 0.45, (255, 255, 255)  # brightness of the photo under ellipses, and RGB colour of superpixel borders
@@ -129,7 +129,7 @@ class Run:
     def written(self) -> int:
         """Row in the result of the first of the fitted Gaussians that the result has."""
         means = self.made["fit_scene"].gaussians.means[self.fitted]
-        of_result = [mean.tobytes() for mean in self.made["prune_and_fill"].gaussians.means]
+        of_result = [mean.tobytes() for mean in self.made["build"].gaussians.means]
         return next(of_result.index(mean.tobytes()) for mean in means if mean.tobytes() in of_result)
 
 
@@ -351,7 +351,7 @@ def build_section(run: Run) -> str:
     size = int(np.diff(features.starts)[at])
     own = np.flatnonzero(matches.clusters == matches.clusters[at])
     faint = int((features.gains < 1).sum())
-    report, written = fitted.report, made["prune_and_fill"].gaussians
+    report, written = fitted.report, made["build"].gaussians
     before, after = ({mean.tobytes() for mean in some.means} for some in (fitted.gaussians, written))
     others = [row for row, mean in enumerate(written.means) if mean.tobytes() not in before]
     return "\n\n".join([
@@ -370,7 +370,7 @@ def build_section(run: Run) -> str:
             entry("merge: features.means", merged.means, run.merged),
             entry("decode_merged: gaussians.scales", decoded.gaussians.scales, run.merged, 4),
             entry("fit_scene: gaussians.scales", fitted.gaussians.scales, children[0], 4),
-            *[entry("prune_and_fill: gaussians.means", written.means, row) + " (a new one)" for row in others[:1]],
+            *[entry("fill_between: gaussians.means", written.means, row) + " (a new one)" for row in others[:1]],
         ]),
         text(
             "**Superpixels** follow colour borders in the photo, because a Gaussian has one colour.",
@@ -406,9 +406,9 @@ def build_section(run: Run) -> str:
             ),
         ),
         text(
-            f"**`prune_and_fill`** leaves out {len(before - after)} Gaussians, which change no photo by more than",
-            "rounding does. Places that cameras between the photos see empty would be filled,",
-            say("but this scene has none.", not others),
+            f"**`split_unseen`** finds {len(before - after)} Gaussians that change no photo by more than rounding",
+            "does, and they are dropped. **`fill_between`** would fill places that cameras between the photos see",
+            say("empty, but this scene has none.", not others),
         ),
     ])  # fmt: skip
 

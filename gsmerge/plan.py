@@ -1,13 +1,14 @@
 """The plan of a run: only this module decides what effort, budget, recipe and names of checkpoints mean.
 
-Every choice is a function here. :func:`make_plan` makes all choices for a prepared scene or block.
-:func:`choose_for_scene` makes only the choices that need no computation, for estimates and for scenes in blocks. Each
-stage gets its own part of the plan, and no stage knows the options of another.
+:func:`make_plan` makes all choices for a prepared scene or block. :func:`plan_scene` makes only the choices that need
+no computation, for estimates and for scenes in blocks. Each stage gets its own part of the plan, and no stage knows the
+options of another.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -26,18 +27,11 @@ from gsmerge.runtime.record import note, stage
 from gsmerge.settings.budget import AUTO
 from gsmerge.settings.compact import CHECKPOINTS, OURS, CompactOptions
 from gsmerge.settings.fit import GROW_ROUNDS, GROW_STEPS, STEPS, USUAL_SHARE, FitOptions
-from gsmerge.settings.stages import (
-    SHARE,
-    USUAL_K,
-    CleanOptions,
-    DecodeOptions,
-    MatchMethod,
-    MatchOptions,
-    SegmentOptions,
-)
+from gsmerge.settings.stages import SHARE, USUAL_K, CleanOptions, DecodeOptions, MatchOptions
 from gsmerge.stages.fit_pairs import choose_power
 from gsmerge.stages.pair_merge import POWERS
 from gsmerge.stages.segment import SharedTree, SuperpixelChoices
+from gsmerge.types import Gaussians
 
 if TYPE_CHECKING:
     from gsmerge.networks.checkpoint import Checkpoint
@@ -100,15 +94,17 @@ class Plan:
     auto_count: bool  # The scene's own curve decides the number of Gaussians
     levels: int  # Levels of detail
     output: str  # Name of the output's file, whose format may round values; "": no file
-    size: FileSize | None  # Largest size of the output's file; None: any
-    scored_views: tuple[int, ...]  # Ids of the views in which input and result are scored
     seed: int  # All random choices depend on this number alone
-    checkpoint: Checkpoint | None  # Networks, from a file; None: closed formulas alone
     settings: dict[str, Any]  # All settings by flat name, for reports
+    scored_views: tuple[int, ...] = ()  # Ids of the views in which input and result are scored
+    checkpoint: Checkpoint | None = None  # Networks, from a file; None: closed formulas alone
+    file_size: FileSize | None = None  # Largest size of the output's file; None: any
     power: float = POWERS[0]  # Power of the masses by which pairs are merged
     free_poses: bool = False  # The options ask the fit to move cameras, even if the scene does not need it
     samples: bool = False  # Only a sample of the pixels is scored, because only the report needs the scores
     new_views: bool = False  # Estimate the quality of new views
+    # How another package builds a number of Gaussians; None: gsmerge's own stages build them
+    run: Callable[[Prepared, Plan, int], Gaussians] | None = None
     is_trial: bool = False  # The result is only scored on left-out photos, so gaps need not be filled
     before: PhotoScore | None = None  # Score of the input, if the result has to keep its quality on photos
     # [h,w] bool for each scored view: the pixels that the input covers, if it leaves gaps and its renders stand for
@@ -144,6 +140,16 @@ class Plan:
         return self.fit.min_contribution > 0
 
     @property
+    def has_quality(self) -> bool:
+        """Return whether a quality or the scene's curve decides the number of Gaussians."""
+        return self.target_psnr is not None or self.max_drop is not None or self.auto_count or self.keeps_fidelity
+
+    @property
+    def searches(self) -> bool:
+        """Return whether several counts may be built: for a quality, for the file's size, or to clean up a result."""
+        return self.has_quality or (self.file_size is not None and self.file_size.packed) or self.clean.asked
+
+    @property
     def limits(self) -> CountLimits:
         """Limits of the number of Gaussians."""
         return self.superpixels.limits
@@ -157,149 +163,125 @@ class Plan:
         return replace(self, fit=fit, superpixels=replace(self.superpixels, start_share=1.0))
 
 
-@dataclass(frozen=True)
-class FilledOptions:
-    """Options in which settings such as "auto" are replaced by what the scene needs."""
-
-    original: CompactOptions  # The options of the caller
-    options: CompactOptions  # With K, and with a budget that the scene can use
-    segment: SegmentOptions  # With the numbers that depend on effort and scene filled in
-    clean: CleanOptions  # Without the sky, if no photo shows where it is
-
-    @property
-    def counted(self) -> CompactOptions:
-        """The options that decide the number of Gaussians."""
-        superpixels = replace(self.options.segment, superpixels=self.segment.superpixels)
-        return replace(self.options, segment=superpixels)
-
-
-def make_plan(prepared: Prepared, options: CompactOptions, checkpoint: Checkpoint | None = None) -> Plan:
+def make_plan(
+    prepared: Prepared,
+    options: CompactOptions,
+    checkpoint: Checkpoint | None = None,
+    run: Callable[[Prepared, Plan, int], Gaussians] | None = None,
+) -> Plan:
     """Make all decisions about a run that the options leave open.
 
     The networks are also loaded, because some decisions depend on them. ``checkpoint`` has networks to use instead of
-    the networks that the options name. Raises UsageError if the scene or the networks do not allow what the options ask
-    for.
+    the networks that the options name. ``run`` is the field of :class:`Plan`. Raises UsageError if the scene or the
+    networks do not allow what the options ask for.
     """
     check_pictures(prepared, options)
     with stage("prepare"):
-        checkpoint = checkpoint or load_networks(options, prepared.size)
-        plan = _decide(prepared, _fill_options(prepared, options), checkpoint)
-        if not plan.merges_pairs:
-            return plan
-        count = plan.limits.count or plan.limits.default
-        return replace(plan, power=choose_power(count, prepared, plan.fit, plan.seed))
+        size, budget, cameras = prepared.size, options.budget, prepared.scene.cameras
+        checkpoint = checkpoint or load_networks(options, size)
+        filled = fill_options(prepared, options)
+        has_repeats = len(prepared.scene) < len(prepared.input_scene)
+        num_input = prepared.input_scene.num_gaussians if has_repeats else None  # a budget may be a share of it
+        plan = plan_scene(size, filled, num_input=num_input, keeps=keeps_fidelity(size, options))
+        merges_pairs = plan.merges_pairs and checkpoint is None
+        fit = fit_to_pictures(prepared, filled, plan.fit, merges_pairs=merges_pairs)
+        if plan.keeps_fidelity and has_few_rows(size):
+            few = f"the scene has only {size.num_gaussians:,} Gaussians, fewer than its photos need"
+            note(f"{few}; the result has at most half of them, and more may show the photos better: --budget NUMBER")
+        # a quality that the user asks for is measured on all pixels, and small views have too few tiles for a sample
+        samples = plan.target_psnr is None and not plan.keeps_fidelity
+        samples = samples and scored_tiles(0, cameras.width, cameras.height, 2) is not None
+        # all builds of a run share one tree of regions, by which they cut the views
+        has_tree = plan.has_quality or plan.levels > 1 or plan.limits.count is not None
+        has_tree = has_tree and cuts_views(options, size) and not merges_pairs
+        plan = replace(
+            plan,
+            superpixels=replace(plan.superpixels, shared=SharedTree() if has_tree else None),
+            fit=fit,
+            merges_pairs=merges_pairs,
+            file_size=file_size(budget),
+            scored_views=_choose_scored_views(prepared, EFFORTS[options.effort] if samples else None),
+            samples=samples,
+            checkpoint=checkpoint,
+            settings=replace(options, decode=plan.decode).to_dict() | {"fit_steps": fit.steps},
+            run=run,
+            new_views=plan.new_views and prepared.agreement is not None and prepared.can_leave_out,
+        )
+        if merges_pairs:
+            count = plan.limits.count or plan.limits.default
+            plan = replace(plan, power=choose_power(count, prepared, fit, plan.seed))
+    return plan
 
 
-def _fill_options(prepared: Prepared, options: CompactOptions) -> FilledOptions:
-    """Fill in the settings that the options leave to the scene; notes say why these settings have their values."""
-    size, agreement = prepared.size, prepared.agreement
-    filled = resolve_budget(size, options, agreement)
-    segment = _resolve_superpixels(filled.segment, agreement, EFFORTS[options.effort])
-    clean = _resolve_clean(filled.clean, prepared)
-    decode = resolve_decode(filled, size)
-    if decode.k != filled.decode.k and decode.max_k > USUAL_K:
-        note(f"k: {decode.k}, because one camera shows the scene, and no long fit follows")
-    return FilledOptions(options, replace(filled, decode=decode), segment, clean)
+def plan_scene(
+    size: SceneSize, options: CompactOptions, *, num_input: int | None = None, keeps: bool | None = None
+) -> Plan:
+    """Make the decisions that follow from the scene's size and the options; UsageError for impossible options.
 
-
-def _decide(prepared: Prepared, filled: FilledOptions, checkpoint: Checkpoint | None) -> Plan:
-    """Make the plan of a run, after open settings were filled in and networks loaded."""
-    size, original, options, segment = prepared.size, filled.original, filled.options, filled.segment
-    keeps = keeps_fidelity(size, original)
-    target = FIDELITY_PSNR if keeps and size.rendered else original.budget.target_psnr
-    has_repeats = len(prepared.scene) < len(prepared.input_scene)
-    num_input = prepared.input_scene.num_gaussians if has_repeats else None  # a budget may be a share of this number
-    choices = choose_for_scene(size, filled.counted, num_input=num_input, keeps=keeps)
-    limits, merges_pairs = choices.limits, checkpoint is None and choices.may_merge_pairs
-    fit = _fit_photos(prepared, options, choices.fit)
-    fit = _fit_renders(prepared, options, fit) if merges_pairs else fit
-    if keeps and has_few_rows(size):
-        few = f"the scene has only {size.num_gaussians:,} Gaussians, fewer than its photos need"
-        note(f"{few}; the result has at most half of them, and more may show the photos better: --budget NUMBER")
-    budget, cameras = options.budget, prepared.scene.cameras
-    # a quality that the user asks for is measured on all pixels, and small views have too few tiles for a sample
-    samples = not (keeps or target is not None) and scored_tiles(0, cameras.width, cameras.height, 2) is not None
-    builds_several = keeps or target is not None or budget.max_drop is not None or budget.auto or budget.levels > 1
-    # all builds of a run share one tree of regions, by which they cut the views
-    shares_tree = cuts_views(options, size) and not merges_pairs and (builds_several or limits.count is not None)
+    Estimates, and scenes in blocks, need no more; :func:`make_plan` adds what follows from the pictures. ``num_input``:
+    see :func:`gsmerge.facts.counts.count_limits`. ``keeps``: what :func:`keeps_fidelity` has returned for the options
+    of the caller; None: what this function returns for ``options``.
+    """
+    effort, budget, segment = EFFORTS[options.effort], options.budget, options.segment
+    decode = resolve_decode(options, size)
+    keeps = keeps_fidelity(size, options) if keeps is None else keeps
+    if segment.superpixels == AUTO:  # deciding it would need computation
+        segment = replace(segment, superpixels=SHARE)
+    segment = replace(
+        segment,
+        rectangles=effort.rectangles if segment.rectangles is None else segment.rectangles,
+        early_sweeps=effort.early_sweeps if segment.early_sweeps is None else segment.early_sweeps,
+    )
+    limits = count_limits(size, segment, decode, budget, num_input=num_input)
+    fit = resolve_fit(options, size, limits)
+    match = options.match.match or ("overlap" if effort.merges else "none")
+    networks = choose_networks(replace(options, fit=fit), size)
+    # Views are cut into superpixels if they have pictures other than renders, or if a setting changes superpixels. A
+    # setting of the number of superpixels does not count, because it only says how many Gaussians there are. Without
+    # superpixels, neighbouring Gaussians are merged pair by pair
+    cuts = size.num_views > 0 and (not size.rendered or options.changes_superpixels)
+    # Without a fit, new views look as good as the views of the input, so they need no estimate
+    new_views = fit.fit != "none" and options.effort != "draft" if options.new_views is None else options.new_views
     return Plan(
-        superpixels=SuperpixelChoices(segment, limits, start_share(fit), SharedTree() if shares_tree else None),
-        match=replace(options.match, match=choices.match),
-        decode=options.decode,
+        superpixels=SuperpixelChoices(segment, limits, start_share(fit), None),
+        match=replace(options.match, match=match),
+        decode=decode,
         fit=fit,
-        merges_pairs=merges_pairs,
-        clean=filled.clean,
-        target_psnr=target,
+        merges_pairs=options.method == OURS and networks == "none" and not cuts,
+        clean=options.clean,
+        target_psnr=FIDELITY_PSNR if keeps and size.rendered else budget.target_psnr,
         keeps_fidelity=keeps,
         max_drop=budget.max_drop,
         auto_count=budget.auto,
         levels=budget.levels,
         output=budget.output,
-        size=file_size(original.budget),
-        scored_views=_choose_scored_views(prepared, EFFORTS[options.effort] if samples else None),
-        samples=samples,
         seed=options.seed,
-        checkpoint=checkpoint,
-        settings=replace(options, budget=original.budget).to_dict() | {"fit_steps": fit.steps},
+        settings=options.to_dict() | {"k": decode.k, "match": match, "checkpoint": networks},
         free_poses=options.prepare.poses == "free",
-        # Without a fit, new views look as good as the views of the input, so they need no estimate
-        new_views=fit.fit != "none" and options.effort != "draft" if options.new_views is None else options.new_views,
+        new_views=new_views,
     )
+
+
+def fill_options(prepared: Prepared, options: CompactOptions) -> CompactOptions:
+    """Fill in budget, K, superpixels and clean-up if the options leave them to the scene; notes say why."""
+    size, agreement = prepared.size, prepared.agreement
+    options = resolve_budget(size, options, agreement)
+    decode, segment, clean = resolve_decode(options, size), options.segment, options.clean
+    if segment.superpixels == AUTO:
+        text, why = describe_share(agreement)
+        note(f"superpixels: {text} of the pixels, because {why}")
+        segment = replace(segment, superpixels=text)
+    if "sky" in clean.drops and prepared.reference.name == RENDERS:
+        note("drop sky: no photo that is used shows where the sky is, so it is kept")
+        clean = replace(clean, drop=",".join(name for name in clean.drops if name != "sky") or None)
+    if decode.k != options.decode.k and decode.max_k > USUAL_K:
+        note(f"k: {decode.k}, because one camera shows the scene, and no long fit follows")
+    return replace(options, decode=decode, segment=segment, clean=clean)
 
 
 def cuts_views(options: CompactOptions, size: SceneSize) -> bool:
     """Return whether a run cuts views into superpixels, which networks can correct; baselines use no networks."""
     return options.method == OURS and size.num_views > 0
-
-
-@dataclass(frozen=True)
-class SceneChoices:
-    """Decisions about a whole scene that follow from its size and the options, without computation.
-
-    A run, the estimate of the run and the blocks of the run use the same choices.
-    """
-
-    decode: DecodeOptions  # Gaussians per group
-    limits: CountLimits  # Limits of the number of Gaussians
-    match: MatchMethod  # How Gaussians are merged across views
-    checkpoint: str  # Name of the networks to load, or "none"
-    fit: FitOptions  # With the number of steps
-    keeps_fidelity: bool  # See :func:`keeps_fidelity`
-    may_merge_pairs: bool  # Merge neighbours pair by pair, unless the plan is given networks
-
-    def settings(self, options: CompactOptions) -> dict[str, Any]:
-        """Return all settings by flat name, with the values that the plan chose."""
-        return options.to_dict() | {"k": self.decode.k, "match": self.match, "checkpoint": self.checkpoint}
-
-
-def choose_for_scene(
-    scene: SceneSize, options: CompactOptions, *, num_input: int | None = None, keeps: bool | None = None
-) -> SceneChoices:
-    """Make the decisions that follow from the scene's size and the options; UsageError for impossible options.
-
-    ``num_input``: see :func:`gsmerge.facts.counts.count_limits`. ``keeps``: what :func:`keeps_fidelity` has returned
-    for the options of the caller; None: what this function returns for ``options``.
-    """
-    keeps = keeps_fidelity(scene, options) if keeps is None else keeps
-    if scene.num_views == 0 and options.fit.fit_steps is None and not EFFORTS[options.effort].fits_alone:
-        options = replace(options, fit=replace(options.fit, fit="none"))
-    segment, decode = options.segment, resolve_decode(options, scene)
-    if segment.superpixels == AUTO:  # deciding it would need computation
-        segment = replace(segment, superpixels=SHARE)
-    limits = count_limits(scene, segment, decode, options.budget, num_input=num_input)
-    fit = resolve_fit(options)
-    share = limits.share if fit.share is None and scene.num_views else fit.share
-    steps = steps_for(options, scene.num_views, USUAL_SHARE if share is None else share)
-    grow_steps = max(GROW_STEPS, GROW_ROUNDS * scene.num_views)
-    fit = replace(fit, fit_steps=steps, share=share, grow_steps=grow_steps)
-    match = options.match.match or ("overlap" if EFFORTS[options.effort].merges else "none")
-    networks = choose_networks(options, scene)
-    # Views are cut into superpixels if they have pictures other than renders, or if a setting changes superpixels. A
-    # setting of the number of superpixels does not count, because it only says how many Gaussians there are. Without
-    # superpixels, neighbouring Gaussians are merged pair by pair
-    cuts = scene.num_views > 0 and (not scene.rendered or options.changes_superpixels)
-    may_merge_pairs = options.method == OURS and networks == "none" and not cuts
-    return SceneChoices(decode, limits, match, networks, fit, keeps, may_merge_pairs)
 
 
 def choose_blocks(scene: SceneSize, options: CompactOptions) -> int:
@@ -452,26 +434,6 @@ def describe_share(agreement: Agreement | None) -> tuple[str, str]:
     return f"{100 * agreement.share:.3g}%", f"other views confirm {100 * agreement.confirmed:.0f} % of the pixels"
 
 
-def _resolve_superpixels(options: SegmentOptions, agreement: Agreement | None, effort: Effort) -> SegmentOptions:
-    """Fill in the settings of superpixels that depend on effort and scene; a note says why."""
-    if options.superpixels == AUTO:
-        text, why = describe_share(agreement)
-        note(f"superpixels: {text} of the pixels, because {why}")
-        options = replace(options, superpixels=text)
-    rectangles = effort.rectangles if options.rectangles is None else options.rectangles
-    sweeps = effort.early_sweeps if options.early_sweeps is None else options.early_sweeps
-    return replace(options, rectangles=rectangles, early_sweeps=sweeps)
-
-
-def _resolve_clean(options: CleanOptions, prepared: Prepared) -> CleanOptions:
-    """Drop no sky if no photo shows where the sky is, and add a note."""
-    if "sky" not in options.drops or prepared.reference.name != RENDERS:
-        return options
-    note("drop sky: no photo that is used shows where the sky is, so it is kept")
-    remaining = ",".join(name for name in options.drops if name != "sky")
-    return replace(options, drop=remaining or None)
-
-
 def resolve_decode(options: CompactOptions, scene: SceneSize) -> DecodeOptions:
     """Choose K if the option is "auto": 4 if all views have the same camera and no long fit follows, otherwise 1.
 
@@ -484,17 +446,29 @@ def resolve_decode(options: CompactOptions, scene: SceneSize) -> DecodeOptions:
     if not (scene.has_own_pixels and scene.num_cameras == 1):
         return replace(decode, k=USUAL_K)
     decides_count = options.budget.quality is not None or options.changed_counts
-    has_long_fit = options.fit.fit != "none" and resolve_fit(options).steps > SHORT_STEPS
+    steps = EFFORTS[options.effort].steps if options.fit.fit_steps is None else options.fit.fit_steps
+    has_long_fit = options.fit.fit != "none" and steps > SHORT_STEPS
     keeps_k = decides_count or options.replaces_stages or has_long_fit
     return replace(decode, k=USUAL_K if keeps_k else LONE_K)
 
 
-def resolve_fit(options: CompactOptions) -> FitOptions:
-    """Fill in the number of steps by effort. In a draft without a fit, keep Gaussians that no photo shows."""
-    fit, effort = options.fit, EFFORTS[options.effort]
-    steps = effort.steps if fit.fit_steps is None else fit.fit_steps
+def resolve_fit(options: CompactOptions, size: SceneSize, limits: CountLimits) -> FitOptions:
+    """Fill in the settings of the fit that depend on effort and size.
+
+    In a draft without a fit, Gaussians that no photo shows are kept. A draft of a scene without views has no fit.
+    """
+    fit, effort, views = options.fit, EFFORTS[options.effort], size.num_views
+    if views == 0 and fit.fit_steps is None and not effort.fits_alone:
+        fit = replace(fit, fit="none")
     prunes = fit.fit != "none" or effort.prunes
-    return replace(fit, fit_steps=steps, min_contribution=fit.min_contribution if prunes else 0.0)
+    share = limits.share if fit.share is None and views else fit.share
+    return replace(
+        fit,
+        fit_steps=steps_for(options, views, USUAL_SHARE if share is None else share),
+        share=share,
+        grow_steps=max(GROW_STEPS, GROW_ROUNDS * views),
+        min_contribution=fit.min_contribution if prunes else 0.0,
+    )
 
 
 def steps_for(options: CompactOptions, num_views: int, share: float = USUAL_SHARE) -> int:
@@ -511,30 +485,27 @@ def steps_for(options: CompactOptions, num_views: int, share: float = USUAL_SHAR
     return round(min(max(1.0, math.sqrt(share / USUAL_SHARE)), MOST_STEPS) * steps)
 
 
-def _fit_photos(prepared: Prepared, options: CompactOptions, fit: FitOptions) -> FitOptions:
-    """Fill in the settings of the fit that depend on other options and on the scene.
+def fit_to_pictures(prepared: Prepared, options: CompactOptions, fit: FitOptions, *, merges_pairs: bool) -> FitOptions:
+    """Fill in the settings of the fit that depend on the pictures and on other options.
 
     These settings are the scale of the photos, and whether the fit moves cameras, fills the budget, and keeps Gaussians
-    beyond all views.
+    beyond all views. If pairs are merged, the fit is to renders of the input. It allows long thin Gaussians, because
+    the input may have them, and is not scored on held-out patches. Gaussians beyond all views, and Gaussians that
+    hardly show in any view, are kept, because they belong to the scene.
     """
-    scene = prepared.scene
-    fit = replace(fit, beyond=options.prepare.extent == "beyond", fills=options.budget.is_filled)
-    if fit.fit == "none":
-        return replace(fit, photo_scale=1.0)
-    scale, problem = photo_scale(scene, fit, auto=EFFORTS[options.effort].large_photos)
-    if problem is not None:
-        note(problem)
-    free = options.prepare.poses == "free" or (options.prepare.poses == "auto" and prepared.moved)
-    moves = free and fit.fit == "full" and prepared.reference.of_views
-    return replace(fit, photo_scale=scale, move_cameras=moves)
-
-
-def _fit_renders(prepared: Prepared, options: CompactOptions, fit: FitOptions) -> FitOptions:
-    """Fill in the settings of a fit to renders of the input.
-
-    Long thin Gaussians are allowed, because the input may have them. The fit is not scored on held-out patches.
-    Gaussians beyond all views, and Gaussians that hardly show in any view, are kept, because they belong to the scene.
-    """
+    scale, moves = 1.0, False
+    if fit.fit != "none":
+        scale, problem = photo_scale(prepared.scene, fit, auto=EFFORTS[options.effort].large_photos)
+        if problem is not None:
+            note(problem)
+        is_free = options.prepare.poses == "free" or (options.prepare.poses == "auto" and prepared.moved)
+        moves = is_free and fit.fit == "full" and prepared.reference.of_views
+    fit = replace(
+        fit, photo_scale=scale, move_cameras=moves, beyond=options.prepare.extent == "beyond",
+        fills=options.budget.is_filled,
+    )  # fmt: skip
+    if not merges_pairs:
+        return fit
     if prepared.reference.placed and fit.fit == "none" and options.fit.fit != "none":
         note(NO_FIT)
     tuning = replace(fit.tuning, max_ratio=math.inf)

@@ -1,4 +1,4 @@
-"""Compact many scenes with :func:`gsmerge.compaction.files.compact_files`, on this machine or on a cluster."""
+"""Compact many scenes with :func:`gsmerge.compaction.compact.compact_files`, on this machine or on a cluster."""
 
 from gsmerge.batch.jobs import BatchOptions, Job, find_jobs
 from gsmerge.batch.run import run_batch

@@ -10,7 +10,7 @@ from string import Formatter
 from typing import Any
 
 from gsmerge.batch.find import count_links, find_named_scenes, main_file, scene_plys
-from gsmerge.compaction.files import compact_files
+from gsmerge.compaction.compact import compact_files
 from gsmerge.compaction.outputs import Outputs
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import OUTPUT_FORMATS

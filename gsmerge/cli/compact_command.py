@@ -115,7 +115,7 @@ def _compact(
         print_estimate(args, source, settings, outputs, hints)
         return
     _warn_of_memory(source, settings, quiet=args.silent)
-    from gsmerge.compaction.files import compact_files
+    from gsmerge.compaction.compact import compact_files
 
     seconds_before = {"import": perf_counter() - args.start}
     with separate_stdout(engine.engine, quiet=args.silent), stage_progress(quiet=args.silent) as progress:

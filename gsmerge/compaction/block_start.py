@@ -10,7 +10,7 @@ from gsmerge.compaction.partition import Block, Covisibility, owning_views
 from gsmerge.compaction.scores import measure_input
 from gsmerge.facts.prepare import Prepared, prepare
 from gsmerge.geometry.frame import Frame
-from gsmerge.pipeline import decode_views
+from gsmerge.pipeline import merge_views
 from gsmerge.plan import Plan, make_plan
 from gsmerge.runtime.memory import free_pages, make_array
 from gsmerge.runtime.record import begin_part
@@ -39,10 +39,10 @@ def start_block(
 
     ``piece`` is the scene of the block's views. ``frame`` is the canonical frame of all blocks.
     """
-    begin_part()
+    begin_part("merge")
     prepared = prepare(piece, options.prepare, frame)
     plan = make_plan(prepared, options)
-    decoded = decode_views(prepared, plan, plan.limits.count)
+    decoded = merge_views(prepared, plan, plan.limits.count)
     keep = belongs_to_block(frame.leave(decoded.gaussians).means, block, covisibility)
     before = measure_input(prepared, plan)
     return BlockStart(

@@ -11,7 +11,7 @@ import numpy as np
 
 from gsmerge.compaction.block_report import join_reports
 from gsmerge.compaction.block_start import BlockStart, start_block
-from gsmerge.compaction.costs import RunCosts
+from gsmerge.compaction.costs import INPUT_STEPS, STAGE_STEPS
 from gsmerge.compaction.file_size import drop_to_bytes, measure_least_bytes
 from gsmerge.compaction.partition import (
     Block,
@@ -26,10 +26,11 @@ from gsmerge.compaction.result import CompactResult
 from gsmerge.compaction.scores import measure_result
 from gsmerge.compaction.seams import fit_seams
 from gsmerge.facts.counts import file_size
+from gsmerge.facts.scene_size import SceneSize
 from gsmerge.fit import fit_scene, peak_weights
 from gsmerge.geometry.frame import Frame, scene_frame
 from gsmerge.photos.views import subset
-from gsmerge.plan import WHOLE_GAUSSIANS, SceneChoices
+from gsmerge.plan import WHOLE_GAUSSIANS, Plan, plan_scene
 from gsmerge.raster.photos import blank_photos
 from gsmerge.runtime.memory import free_pages, memory_bytes
 from gsmerge.runtime.record import (
@@ -58,6 +59,14 @@ MOST_DENSITY = 2.0
 BLOCK_SURPLUS = 1.03  # Gaussians of all blocks, relative to the requested number; the faintest are dropped at the end
 
 
+def compact_in_blocks(scene: Scene, options: CompactOptions, size: SceneSize, count: int) -> CompactResult | None:
+    """Compact a scene in ``count`` blocks of views, or in fewer; None if one block is enough."""
+    blocks, covisibility = cut_views(scene, options, count)
+    if len(blocks) == 1:
+        return None
+    return compact_blocks(scene, options, plan_scene(size, options), blocks, covisibility)
+
+
 def cut_views(scene: Scene, options: CompactOptions, count: int) -> tuple[list[Block], Covisibility]:
     """Cut the views of a scene into ``count`` blocks; also return how much each view sees of every other view.
 
@@ -71,8 +80,8 @@ def cut_views(scene: Scene, options: CompactOptions, count: int) -> tuple[list[B
         return partition(covisibility.weights, count), covisibility
 
 
-def compact_in_blocks(
-    scene: Scene, options: CompactOptions, choices: SceneChoices, blocks: Sequence[Block], covisibility: Covisibility
+def compact_blocks(
+    scene: Scene, options: CompactOptions, plan: Plan, blocks: Sequence[Block], covisibility: Covisibility
 ) -> CompactResult:
     """Compact a scene in blocks of views.
 
@@ -81,13 +90,13 @@ def compact_in_blocks(
     neighbours, and keeps the Gaussians that belong to it. At the border of two blocks, both fit the same Gaussians to
     the same photos.
     """
-    device, scene = scene.gaussians.device, scene.numpy()
-    count, limit = len(blocks), choices.limits.count
+    scene = scene.numpy()
+    count, limit = len(blocks), plan.limits.count
     if scene.images is not None:
         note(f"compacted in {count} blocks of views: photos keep their exposures, and new views are not estimated")
     with stage("partition"):
         factors = count_factors(blocks, covisibility).tolist()
-        frame, options = scene_frame(scene), with_choices(options, choices)
+        frame, options = scene_frame(scene), with_choices(options, plan)
     size = gaussians_at_once(scene.num_gaussians, count)
     memory = memory_bytes(size, num_rest=3 * scene.gaussians.shN.shape[1])
     engine = options.blocks.engine
@@ -102,7 +111,7 @@ def compact_in_blocks(
                 free_scene(scene)  # its pages can be read again from the file; the piece is a copy
                 yield piece, block, shared, piece_options, frame
 
-        expect_parts(block_parts(scene, options, choices, count))
+        expect_parts(block_parts(len(scene), 0 if plan.fit.fit == "none" else plan.fit.steps, count))
         starts = [start for start, _ in adopt_records(work.run("merge", start_block, count, pieces()))]
         with stage("join"):
             joined, owners = join_parts([start.gaussians for start in starts])
@@ -115,7 +124,7 @@ def compact_in_blocks(
         fitted = list(adopt_records(work.run("fit", fit_block, count, list_calls(starts, shared_start, growth))))
         joined, owners = join_parts([gaussians for gaussians, _ in fitted])
         joined = fit_seams(joined, owners, starts, options.seed)
-        result = finish_joined(joined, scene.cameras, scene.names, frame, options, choices)
+        result = finish_joined(joined, scene.cameras, scene.names, frame, options, plan)
         scored = work.run("score", score_block, count, list_calls(starts, work.share(result)))
         scores = [score for score, _ in adopt_records(scored)]
     facts = [
@@ -126,7 +135,7 @@ def compact_in_blocks(
         for start, (_, block_choices), score in zip(starts, fitted, scores, strict=True)
     ]  # fmt: skip
     record_choices(blocks=facts)
-    return CompactResult(result, join_reports(scene, result, starts, scores, options), scene.cameras).to(device)
+    return CompactResult(result, join_reports(scene, result, starts, scores, options), scene.cameras)
 
 
 def join_parts(parts: Sequence[Gaussians]) -> tuple[Gaussians, np.ndarray]:
@@ -134,21 +143,15 @@ def join_parts(parts: Sequence[Gaussians]) -> tuple[Gaussians, np.ndarray]:
     return Gaussians.concat(parts), np.repeat(np.arange(len(parts)), [len(gaussians) for gaussians in parts])
 
 
-def block_parts(scene: Scene, options: CompactOptions, choices: SceneChoices, count: int) -> list[RunPart]:
+def block_parts(views: int, steps: int, count: int) -> list[RunPart]:
     """Return the parts of a run in ``count`` blocks: merge each block, fit each, fit the seams, score each block.
 
-    All blocks are assumed to cost the same.
+    All blocks are assumed to cost the same, and the fit of the seams half as much as the fits of all blocks.
     """
-    steps, num_gaussians = 0 if choices.fit.fit == "none" else choices.fit.steps, choices.limits.default
-    costs = RunCosts(
-        settings=choices.settings(options), num_pixels=scene.pixels_per_view * len(scene),
-        view_pixels=scene.pixels_per_view, inside=1 / count, steps=steps,
-    )  # fmt: skip
-    build, [scores] = costs.build_part(num_gaussians), costs.end_parts(num_gaussians, [])
-    merge_part, fit_part = RunPart(build.stages / count), RunPart(0.0, build.fits / count)
-    seam_cost = 0.5  # cost of the fit of seams, relative to the fits of all blocks
-    seams = [RunPart(0.0, seam_cost * build.fits)] * (steps > 0)
-    return [merge_part] * count + [fit_part] * count + seams + [RunPart(scores.stages / count)] * count
+    merges = [RunPart("merge", STAGE_STEPS * views / count)] * count
+    scores = [RunPart("score", INPUT_STEPS * views / count)] * count
+    fits = [*[RunPart("fit", 0.0, steps / count)] * count, RunPart("seams", 0.0, 0.5 * steps)]
+    return [*merges, *fits, *scores]
 
 
 def adopt_records(outcomes: Iterable[tuple[T, Record]]) -> Iterator[tuple[T, dict[str, Any]]]:
@@ -183,7 +186,7 @@ def fit_block(start: BlockStart, shared_start: tuple[Gaussians, np.ndarray], gro
     ``shared_start`` has the canonical Gaussians of all blocks, and for each the number of the block that owns it.
     ``growth`` is the final number of Gaussians divided by the number at the start. ``number`` is that of the block.
     """
-    begin_part()
+    begin_part("fit")
     (joined, owners), scene, plan = shared_start, start.prepared.scene, start.plan
     used = owners == number
     if plan.fit.fit != "none":
@@ -199,18 +202,18 @@ def fit_block(start: BlockStart, shared_start: tuple[Gaussians, np.ndarray], gro
 
 def score_block(start: BlockStart, gaussians: Gaussians, _: int) -> float | None:
     """Return the PSNR (dB) of the result of all blocks on the photos of one block; None without photos."""
-    begin_part()
+    begin_part("score")
     measured = measure_result(gaussians, start.prepared, start.plan)
     return None if measured is None else measured.psnr
 
 
 def finish_joined(
     joined: Gaussians, cameras: Cameras, names: Sequence[str], frame: Frame, options: CompactOptions,
-    choices: SceneChoices,
+    plan: Plan,
 ) -> Gaussians:  # fmt: skip
     """Prune the canonical Gaussians of all blocks, move them into the world, meet the budget, and return them."""
-    limit = choices.limits.count
-    if choices.fit.min_contribution > 0:
+    limit = plan.limits.count
+    if plan.fit.min_contribution > 0:
         joined = prune_joined(joined, frame.enter_cameras(cameras), options, limit)
     result = frame.leave(joined)
     if limit is not None and limit < len(result):
@@ -241,11 +244,11 @@ def free_scene(scene: Scene) -> None:
     free_pages([*vars(scene.gaussians).values(), *([] if scene.images is None else [scene.images])])
 
 
-def with_choices(options: CompactOptions, choices: SceneChoices) -> CompactOptions:
+def with_choices(options: CompactOptions, plan: Plan) -> CompactOptions:
     """Return options with the steps of the fit, the networks and the density that were chosen for the whole scene."""
-    checkpoint = options.checkpoint if choices.checkpoint != "none" else "none"
-    options = options.with_settings({"fit_steps": choices.fit.steps, "checkpoint": checkpoint})
-    return replace(options, fit=replace(options.fit, share=choices.limits.share))
+    checkpoint = options.checkpoint if plan.settings["checkpoint"] != "none" else "none"
+    options = options.with_settings({"fit_steps": plan.fit.steps, "checkpoint": checkpoint})
+    return replace(options, fit=replace(options.fit, share=plan.limits.share))
 
 
 def block_options(

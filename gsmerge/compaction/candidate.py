@@ -10,8 +10,9 @@ from gsmerge.fit import Fitted
 from gsmerge.geometry.frame import scene_depth
 from gsmerge.io.cameras.camera_file import describe_moves, list_moves
 from gsmerge.photos.row_colors import RENDERS
+from gsmerge.pipeline import build
 from gsmerge.plan import Plan, own_views
-from gsmerge.runtime.record import Record, current_record, note, record_choices, record_part, stage
+from gsmerge.runtime.record import Record, begin_part, current_record, note, record_choices, record_part, stage
 from gsmerge.types import Cameras, Gaussians
 
 
@@ -27,10 +28,22 @@ class Candidate:
     record: Record  # Seconds, choices and notes of building and scoring it
     # PSNR (dB) that a search compares with its target. If the input leaves gaps, only the pixels that it covers count
     deciding_psnr: float | None = None
+    unmet: str | None = None  # Why it does not meet the target of a search; None if it does, or without a target
 
 
-def make_candidate(count: int | None, fitted: Fitted, prepared: Prepared, plan: Plan) -> Candidate:
-    """Move fitted canonical Gaussians into the world, measure their PSNR, and return them as a candidate."""
+@record_part()
+def build_candidate(prepared: Prepared, plan: Plan, count: int | None) -> Candidate:
+    """Build one of several results of a run, clean it up as the plan says, and score it, with a record of its own."""
+    begin_part("build")
+    if plan.clean.asked:
+        from gsmerge.compaction.clean_up import build_cleaned
+
+        return score(build_cleaned(prepared, plan, count), prepared, plan, count)
+    return score(build(prepared, plan, count), prepared, plan, count)
+
+
+def score(fitted: Fitted, prepared: Prepared, plan: Plan, count: int | None = None) -> Candidate:
+    """Move fitted canonical Gaussians into the world, and measure their PSNR; ``count`` is the number asked for."""
     moved = with_moved_views(prepared, fitted.cameras)
     gaussians, cameras = moved.frame.leave(fitted.gaussians), moved.input_scene.cameras
     if cameras is not prepared.input_scene.cameras:
@@ -43,8 +56,8 @@ def rescore(candidate: Candidate, gaussians: Gaussians, prepared: Prepared, plan
     """Return the candidate with only ``gaussians``, which are some or all of its Gaussians, and with their PSNR."""
     with record_part(silent=True) as record:
         psnr, _ = _measure_candidate(gaussians, with_moved_views(prepared, candidate.fitted.cameras), plan)
-    choices = candidate.record.choices | record.choices
-    return replace(candidate, gaussians=gaussians, psnr=psnr, record=replace(candidate.record, choices=choices))
+    candidate.record.choices.update(record.choices)
+    return replace(candidate, gaussians=gaussians, psnr=psnr)
 
 
 def _measure_candidate(gaussians: Gaussians, moved: Prepared, plan: Plan) -> tuple[float | None, float | None]:

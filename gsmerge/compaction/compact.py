@@ -1,54 +1,48 @@
-"""Compact a scene in memory: in one piece, or in blocks of views.
+"""The road of a run: read -> prepare -> plan -> build -> score -> write.
 
-In one piece, a result is built once if its number of Gaussians is known, otherwise several times until a quality is
-met.
+:func:`compact_files` reads and writes, :func:`compact_scene` prepares and plans, and :func:`compact_prepared` builds
+and scores. A plain run goes through these functions from top to bottom. :func:`gsmerge.pipeline.build` calls the stages
+in their order. Every other run, such as a search for the number of Gaussians, is one call behind an ``if``; its module
+calls ``build`` as often as it needs.
 """
 
 from __future__ import annotations
 
-import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from os import PathLike
+from time import perf_counter
 from typing import Any
-from weakref import ref
 
-import numpy as np
-
-from gsmerge.compaction.candidate import Candidate, make_candidate
-from gsmerge.compaction.costs import measure_costs
-from gsmerge.compaction.file_size import meet_bytes
-from gsmerge.compaction.methods import Method, choose_method
-from gsmerge.compaction.new_views import try_new_views
+from gsmerge.compaction.candidate import Candidate, score
+from gsmerge.compaction.costs import run_parts
+from gsmerge.compaction.files import list_first_layers, read_input, with_output_name
+from gsmerge.compaction.methods import choose_method
+from gsmerge.compaction.outputs import Outputs, add_outputs, frame_notes, refuse_to_replace_cameras
+from gsmerge.compaction.report import report_document
 from gsmerge.compaction.result import CompactResult, make_result
-from gsmerge.compaction.search import CountSearch, add_target, build_left_out, search_count
-from gsmerge.errors import Doubt, DoubtWarning, TargetError
-from gsmerge.facts.counts import level_counts
+from gsmerge.errors import Doubt, DoubtWarning, SceneError, TargetError
 from gsmerge.facts.crop import crop_scene
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.scene_size import measure_size
-from gsmerge.fit import Fitted
-from gsmerge.pipeline import Build
-from gsmerge.plan import Plan, choose_blocks, choose_for_scene, make_plan
-from gsmerge.runtime.record import (
-    Progress,
-    Record,
-    add_seconds,
-    adopt,
-    begin_part,
-    expect_parts,
-    note,
-    record_choices,
-    record_part,
-    record_run,
-)
+from gsmerge.io import atomic_outputs
+from gsmerge.io.formats.arrays import result_comments
+from gsmerge.io.formats.rounding import format_notes
+from gsmerge.io.formats.table import Contents
+from gsmerge.io.scene_files import SceneFiles, scene_title
+from gsmerge.photos.row_colors import RENDERS
+from gsmerge.pipeline import build
+from gsmerge.plan import Plan, choose_blocks, make_plan
+from gsmerge.runtime.record import Progress, begin_part, expect_parts, note, record_part, record_run
 from gsmerge.runtime.threads import use_threads
+from gsmerge.scene.content_hash import doubt_changed
+from gsmerge.scene.exporters import NO_HINTS, ReadHints
 from gsmerge.scene.input import as_scene
+from gsmerge.scene.read import Loaded
 from gsmerge.settings.compact import CompactOptions
-from gsmerge.settings.stages import CleanOptions
-from gsmerge.types import Gaussians, Scene, StrPath
+from gsmerge.settings.reading import OpacityChoice
+from gsmerge.types import Scene, StrPath
 from gsmerge.values.arguments import check_arguments
 
 # If a result is clearly worse than its input, the scene is compacted again with these changes of the options, one after
@@ -58,7 +52,6 @@ SIMPLER: Sequence[tuple[str, Callable[[CompactOptions], CompactOptions]]] = (
     ("without a fit", lambda o: o.with_settings({"fit": "none"})),
     ("with more Gaussians", lambda o: replace(o, budget=replace(o.budget, keep=True))),
 )
-SURPLUS = 1.05  # Gaussians that are built, relative to the number that has to remain after clean-up
 
 
 @check_arguments
@@ -96,23 +89,116 @@ def compact(
     return result
 
 
+def compact_files(
+    files: SceneFiles,
+    settings: CompactOptions,
+    outputs: Outputs,
+    *,
+    opacity: OpacityChoice = "auto",
+    hints: ReadHints = NO_HINTS,
+    progress: Progress | None = None,
+    hashed: bool = False,
+    seconds_before: Mapping[str, float] | None = None,
+    on_read: Callable[[Loaded], None] = lambda _: None,
+) -> dict[str, Any]:
+    """Read a scene, compact it, and write result, levels and cameras: all files or none.
+
+    If ``hashed``, the report has hashes of the input files. ``seconds_before`` has the wall time of the caller's
+    earlier steps, by name. ``on_read`` is called with the scene after it was read.
+
+    Returns the report, see :func:`gsmerge.compaction.report.report_document`. Raises SceneError if the scene cannot be
+    read or the result cannot be written, and UsageError if the scene lacks something that the settings need.
+    """
+    start, out, settings = perf_counter(), outputs.result, with_output_name(settings, outputs)
+    format_ = outputs.format
+    with atomic_outputs(overwrite=outputs.overwrite) as add:
+        temporary = add(out)  # before the long work, so that an output that cannot be written ends the run at once
+        load = read_input(files, opacity=opacity, hints=hints, hashed=hashed)
+        on_read(load)
+        views = list_first_layers(load.scene)
+        names = [load.scene.names[view] for view in views]
+        cameras_path = outputs.viewer_cameras if views else None
+        if cameras_path is not None and cameras_path.exists() and not outputs.overwrite:  # fail before the long work
+            refuse_to_replace_cameras(cameras_path, load.scene.cameras[views], names, moved=True)
+        read_at = perf_counter()
+        with use_threads(settings.threads), record_run(progress):
+            result = compact_scene(load.scene, settings)
+        if len(result.gaussians) == 0:
+            problem = "expected Gaussians that show something, found none that remains after merging"
+            raise SceneError(files.ply, problem, "check its scales and opacities")
+        result = result.pad_to_full() if outputs.options.columns == "full" else result
+        compacted_at, results = perf_counter(), (result, *result.coarser)
+        levels, cameras = [level.gaussians for level in results], result.cameras[views]
+        comments = result_comments(result.report.new_views, load.comments)
+        contents = Contents(levels, comments, cameras, names, scene_title(files.ply))
+        level_files = add_outputs(add, outputs, temporary, contents)  # the first level is the result itself
+        notes = [*format_notes(out, result.gaussians), *frame_notes(outputs, cameras), *doubt_changed(load.stats)]
+        document = report_document(
+            result.report, recognised=load.recognised, output_path=out,
+            seconds_before={**(seconds_before or {}), "read": read_at - start},
+            seconds_after={"write": perf_counter() - compacted_at},
+            coarser=[(path, level.report) for path, level in zip([*level_files][1:], result.coarser, strict=True)],
+            notes=[*load.notes, *notes], written_at=level_files, cameras_path=cameras_path,
+        )  # fmt: skip
+    format_.finish(out)
+    return document
+
+
 def compact_scene(scene: Scene, options: CompactOptions) -> CompactResult:
     """Replace a scene by a compact one as :func:`compact` does, within a run that the caller records.
 
     Nothing is checked, and doubts are in the report instead of Python warnings.
     """
-    source = ref(scene)  # a weak reference, so that the result does not keep the scene in memory
+    whole, budget = scene, options.budget
     if options.clean.crop is not None:
         scene = crop_scene(scene.numpy(), options.clean.crop)
-    result = _compact_once(scene, options)
+    size = measure_size(scene)
+    if budget.number is not None and budget.number > size.num_gaussians:
+        note(f"budget {budget.budget}: the input has only {size.num_gaussians:,} Gaussians, so the result has no more")
+    num_blocks = choose_blocks(size, options)
+    if num_blocks > 1:
+        from gsmerge.compaction.blocks import compact_in_blocks
+
+        result = compact_in_blocks(scene, options, size, num_blocks)
+        if result is not None:  # the views are worth several blocks
+            return result.for_scene(whole)
+    method = choose_method(options, scene)
+    prepared = method.prepare(scene.numpy(), options.prepare)
+    result = compact_prepared(prepared, make_plan(prepared, options, run=method.run))
     if result.report.is_far and options.scene_decides:
-        result = _compact_simpler(scene, options, result)
-    if isinstance(scene.gaussians.means, np.ndarray) and scene.gaussians.means.dtype == np.float32:
-        result = result.to_single()
-    return replace(result, scene=source, names=scene.names)
+        result = compact_simpler(scene, options, result)
+    return result.for_scene(whole)
 
 
-def _compact_simpler(scene: Scene, options: CompactOptions, result: CompactResult) -> CompactResult:
+def compact_prepared(prepared: Prepared, plan: Plan) -> CompactResult:
+    """Build the Gaussians of a prepared scene as the plan says, in one piece, and score them."""
+    if plan.keeps_fidelity or prepared.reference.name == RENDERS:
+        from gsmerge.compaction.search import add_target
+
+        plan = add_target(plan, prepared)
+    expect_parts(run_parts(prepared, plan))
+    levels = list[Candidate]()
+    if plan.searches:
+        from gsmerge.compaction.search import search_count
+
+        best = search_count(prepared, plan)
+    else:
+        begin_part("build")
+        best = score(build(prepared, plan, plan.limits.count), prepared, plan)
+    if plan.levels > 1:
+        from gsmerge.compaction.search import build_levels
+
+        levels = build_levels(best, prepared, plan)
+    begin_part("input")
+    result = make_result(best, levels, prepared, plan)
+    if plan.new_views:
+        from gsmerge.compaction.new_views import expect_new_views
+
+        result = replace(result, report=expect_new_views(result.report, prepared, plan))
+    return result
+
+
+def compact_simpler(scene: Scene, options: CompactOptions, result: CompactResult) -> CompactResult:
     """Compact a scene again with the changes of ``SIMPLER``, until a result is not clearly worse than its input.
 
     ``result`` is the first result, which is clearly worse than the input. A note says what was changed. Raises
@@ -125,158 +211,12 @@ def _compact_simpler(scene: Scene, options: CompactOptions, result: CompactResul
             continue
         with record_part():
             note(Doubt(f"{cause}; so it was made again {words}"))
-            result = _compact_once(scene, simpler)
+            method = choose_method(simpler, scene)
+            prepared = method.prepare(scene.numpy(), simpler.prepare)
+            result = compact_prepared(prepared, make_plan(prepared, simpler, run=method.run))
         if not result.report.is_far:
             return result
     problem, budget = f"expected a result as good as its input, found none: {cause}", max(1, len(result.gaussians))
     raise TargetError(
         f"{problem}; gsmerge inspect says how it is read, and --budget {budget} writes a result all the same"
     )
-
-
-def _compact_once(scene: Scene, options: CompactOptions) -> CompactResult:
-    """Compact a scene: in blocks if the views are cut into several blocks, otherwise in one piece."""
-    size, budget = measure_size(scene), options.budget
-    if budget.number is not None and budget.number > size.num_gaussians:
-        note(f"budget {budget.budget}: the input has only {size.num_gaussians:,} Gaussians, so the result has no more")
-    num_blocks = choose_blocks(size, options)
-    if num_blocks > 1:
-        from gsmerge.compaction.blocks import compact_in_blocks, cut_views
-
-        blocks, covisibility = cut_views(scene, options, num_blocks)
-        if len(blocks) > 1:
-            return compact_in_blocks(scene, options, choose_for_scene(size, options), blocks, covisibility)
-    method = choose_method(options, scene)  # our own, or that of another package
-    prepared = method.prepare(scene.numpy(), options.prepare)  # adds the frame, corrected photos and poses
-    return compact_in_one_piece(prepared, method, options).to(scene.gaussians.device)
-
-
-def compact_in_one_piece(prepared: Prepared, method: Method, options: CompactOptions) -> CompactResult:
-    """Compact a prepared scene with a method, in one piece.
-
-    A search finds the number of Gaussians, unless the options state it, and builds the result. Then coarser levels are
-    built, a trial measures what new views gain, and the input is scored for the report.
-    """
-    plan = add_target(make_plan(prepared, options), prepared)  # from here on, the plan replaces the options
-    costs = measure_costs(prepared, plan)
-    expect_parts(costs.all_parts(plan.limits, plan.limits.default))
-    search = search_count(prepared, plan, method.build)
-    best = run_search(search, method.build, prepared)
-    best = meet_bytes(best, partial(build_again, method.build, prepared, plan), prepared, plan)
-    num_best = len(best.gaussians)
-    coarser_counts = level_counts(num_best, plan.levels, plan.limits.min_count)
-    expect_parts(costs.end_parts(num_best, coarser_counts))
-    # coarser levels keep the cameras that the result has
-    level_start = prepared.with_cameras(best.fitted.cameras), plan.with_fixed_cameras()
-    levels = [build_candidate(method.build, *level_start, count) for count in coarser_counts]
-    trial = try_new_views(prepared, plan, method.build, num_best)
-    begin_part()  # the last part, which scores the input
-    return make_result(best, levels, prepared, plan, search.facts(best), trial)
-
-
-def run_search(search: CountSearch, build: Build, prepared: Prepared) -> Candidate:
-    """Run a search for the number of Gaussians; return the best candidate, built from all views and cleaned up."""
-    plan = search.plan
-    if search.left_out is not None:  # candidates lack the left-out views, so the best count is built again
-        search.run(partial(build_left_out, build, search.left_out, search.left_out.plan(plan)))
-        return build_again(build, prepared, plan, search.count)
-    if plan.keeps_fidelity and plan.clean.asked:  # what clean-up leaves out would count as errors in the search
-        search.run(partial(build_candidate, build, prepared, replace(plan, clean=CleanOptions())))
-        return clean_best(search.best, prepared, plan)
-    search.run(partial(build_candidate, build, prepared, plan))
-    return search.best
-
-
-def find_count(scene: Scene, options: CompactOptions) -> int:
-    """Return the number of Gaussians that a run would give a scene without cameras, if a PSNR decides this number.
-
-    Estimates find the number by the same search as runs.
-    """
-    with use_threads(options.threads), record_part(silent=True):
-        method = choose_method(options, scene)
-        prepared = method.prepare(scene.numpy(), options.prepare)
-        plan = add_target(make_plan(prepared, options), prepared)
-        best = run_search(search_count(prepared, plan, method.build), method.build, prepared)
-    return len(best.gaussians)
-
-
-@record_part()
-def build_candidate(build: Build, prepared: Prepared, plan: Plan, count: int | None) -> Candidate:
-    """Build ``count`` Gaussians with a method, clean them up as the plan says, and score them."""
-    begin_part()
-    return make_candidate(count, build_cleaned(build, prepared, plan, count), prepared, plan)
-
-
-def build_again(build: Build, prepared: Prepared, plan: Plan, count: int | None) -> Candidate:
-    """Build a candidate after the search, and add its seconds to the seconds of the run."""
-    candidate = build_candidate(build, prepared, plan, count)
-    add_seconds(candidate.record.seconds)
-    return candidate
-
-
-@record_part()
-def clean_best(candidate: Candidate, prepared: Prepared, plan: Plan) -> Candidate:
-    """Clean up and score again the best candidate of a search that skipped clean-up."""
-    adopt(candidate.record)
-    gaussians, dropped = _clean_fitted(candidate.fitted, prepared, plan)
-    _record_dropped(dropped, len(gaussians), None, prepared)
-    return make_candidate(None, replace(candidate.fitted, gaussians=gaussians), prepared, plan)
-
-
-def build_cleaned(build: Build, prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
-    """Build Gaussians and clean them up, so that ``count`` Gaussians remain if the scene has so many.
-
-    A few more than ``count`` are built. If too few Gaussians remain after clean-up, all are built once more, with a
-    surplus as large as the number that clean-up dropped. If too many Gaussians remain, the faintest are dropped.
-    """
-    if not plan.clean.asked:
-        return build(prepared, plan, count)
-    from gsmerge.stages.clean import faintest_dropped
-
-    def build_once(built_count: int | None) -> tuple[Fitted, dict[str, int], Record]:
-        """Build and clean up once; return what remains, the number of dropped Gaussians by reason, and the record."""
-        with record_part() as record:
-            fitted = build(prepared, plan, built_count)
-            gaussians, dropped = _clean_fitted(fitted, prepared, plan)
-        add_seconds(record.seconds)
-        return replace(fitted, gaussians=gaussians), dropped, record
-
-    max_count = len(prepared.scene.gaussians)
-    first_count = None if count is None else min(max_count, math.ceil(SURPLUS * count))
-    fitted, dropped, record = build_once(first_count)
-    if count is not None and first_count is not None and len(fitted.gaussians) < count and first_count < max_count:
-        factor = SURPLUS * count / max(1, len(fitted.gaussians))
-        fitted, dropped, record = build_once(min(max_count, math.ceil(factor * first_count)))
-    gaussians = fitted.gaussians
-    if count is not None and len(gaussians) > count:
-        gaussians, dropped = faintest_dropped(gaussians, count), dropped | {"surplus": len(gaussians) - count}
-    adopt(record)
-    _record_dropped(dropped, len(gaussians), count, prepared)
-    return replace(fitted, gaussians=gaussians)
-
-
-def _clean_fitted(fitted: Fitted, prepared: Prepared, plan: Plan) -> tuple[Gaussians, dict[str, int]]:
-    """Clean up fitted Gaussians; return the remaining Gaussians, and the number of dropped Gaussians by reason."""
-    from gsmerge.stages.clean import clean
-
-    # Cameras that were placed for scores are too few to show all of the scene. If `clean` gets no cameras, it places
-    # enough to show the whole scene
-    cameras = None if prepared.reference.placed else fitted.cameras[sorted({*prepared.repeated})]
-    rows, dropped = clean(fitted.gaussians, plan.clean, cameras, prepared.scene.images, prepared.frame.leave)
-    return fitted.gaussians[rows], dropped
-
-
-def _record_dropped(dropped: dict[str, int], remaining: int, count: int | None, prepared: Prepared) -> None:
-    """Record the number of dropped Gaussians by reason, with notes, also if fewer than ``count`` remain."""
-    from gsmerge.stages.clean import describe_counts
-
-    record_choices(clean=dropped)
-    # The input was cropped before the run. The crop below only removes Gaussians that the fit moved across the border,
-    # usually none
-    shown = {name: number for name, number in dropped.items() if number or name != "cropped"}
-    if shown:
-        note(f"left out by clean-up: {describe_counts(shown, placed=prepared.reference.placed)}")
-    if dropped.get("sky"):
-        note("PSNR of the input views counts the sky that was left out as errors")
-    if count is not None and remaining < count:
-        note(f"budget: {count:,} Gaussians were asked for, {remaining:,} remain after clean-up")

@@ -18,13 +18,12 @@ from gsmerge.compaction.left_out import LEAST_SEEN, LeftOut
 from gsmerge.facts.prepare import Prepared
 from gsmerge.fit.photo_sizes import holdout_psnr, training_weights
 from gsmerge.kernels.elementary import log, power
-from gsmerge.pipeline import Build
+from gsmerge.pipeline import build
 from gsmerge.plan import Plan
 from gsmerge.raster.metrics import WINDOW, ssim
 from gsmerge.raster.photos import Photos, render_photos, scene_photos
 from gsmerge.runtime.record import begin_part, record_part, report_progress
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.settings.stages import CleanOptions
 from gsmerge.types import Gaussians
 
 PROGRESS = "curve: what each count brings"
@@ -59,7 +58,7 @@ def curve_counts(max_drop: float | None, usual: int, least: int, most: int) -> t
 
 
 def measure_curve(
-    prepared: Prepared, plan: Plan, build: Build, steps: int, counts: Sequence[int], left_out: LeftOut | None = None
+    prepared: Prepared, plan: Plan, steps: int, counts: Sequence[int], left_out: LeftOut | None = None
 ) -> list[CurvePoint]:
     """Measure PSNR and SSIM, at full size, of short fits with each of the ``counts``.
 
@@ -78,11 +77,11 @@ def measure_curve(
         seen = np.flatnonzero(left_out.shares > LEAST_SEEN).tolist()
         photos, weights = left_out.photos[seen], [1 - mask.astype(np.float32) for mask in left_out.seen[seen]]
         prepared, plan, min_gain = left_out.rest, left_out.plan(plan), math.inf
-    short_plan = replace(plan.with_fit(short), checkpoint=None, clean=CleanOptions())
+    short_plan = replace(plan.with_fit(short), checkpoint=None)
     points: list[CurvePoint] = []
     report_progress(PROGRESS, 0, len(counts))
     for count in counts:
-        begin_part()
+        begin_part("curve")
         with record_part(silent=True):
             gaussians = build(prepared, short_plan, left_out.reduce(count) if left_out else count).gaussians
         points.append(_score_fit(count, gaussians, photos, weights, min_gain))

@@ -6,23 +6,29 @@ import os
 from collections.abc import Mapping
 from typing import Any
 
-from gsmerge.compaction.compact import find_count
-from gsmerge.compaction.costs import CountChoice, RunCosts, mean_inside
-from gsmerge.compaction.files import Outputs, with_output_name
+import numpy as np
+
+from gsmerge.compaction.compact import compact_scene
+from gsmerge.compaction.costs import RunCosts, usual_builds
+from gsmerge.compaction.curve import curve_counts
+from gsmerge.compaction.files import with_output_name
 from gsmerge.compaction.methods import choose_method, is_without_views
+from gsmerge.compaction.outputs import Outputs
 from gsmerge.compaction.partition import gaussians_at_once
 from gsmerge.facts.confirm_depths import confirm_depths
+from gsmerge.facts.counts import level_counts
 from gsmerge.facts.crop import crop_scene
 from gsmerge.facts.prepare import views_notes, without_repeats
 from gsmerge.facts.scene_size import measure_size
 from gsmerge.geometry.frame import canonicalise
 from gsmerge.io.formats.ply import file_bytes
 from gsmerge.io.formats.table import find_format
+from gsmerge.measure.coverage import shares_inside
 from gsmerge.measure.documents import document_head, note_entries, note_lines
-from gsmerge.plan import FIDELITY_LOSS, FIDELITY_PSNR, choose_blocks, choose_for_scene, load_networks, resolve_budget
+from gsmerge.plan import FIDELITY_LOSS, FIDELITY_PSNR, choose_blocks, load_networks, plan_scene, resolve_budget
 from gsmerge.runtime.memory import human_bytes, memory_bytes, memory_problem
-from gsmerge.runtime.record import record_run
-from gsmerge.runtime.threads import available_threads
+from gsmerge.runtime.record import record_part, record_run
+from gsmerge.runtime.threads import available_threads, use_threads
 from gsmerge.scene.read import Loaded
 from gsmerge.settings.compact import OURS, CompactOptions
 from gsmerge.types import Scene
@@ -31,6 +37,7 @@ from gsmerge.values.words import count_words
 MAX_SEARCHED_GAUSSIANS = (
     500_000  # most Gaussians of a scene without cameras for which the search is run; it takes seconds
 )
+INSIDE_GAUSSIANS = 10_000  # sample of Gaussians for the share that lies inside a view
 BESIDE = ("cameras", "images", "masks", "protect")  # fields of SceneFiles that are read with the Gaussians
 
 
@@ -55,48 +62,50 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
     size = measure_size(scene)
     if (options.budget.auto or options.budget.is_limit) and scene.has_own_pixels:
         options = resolve_budget(size, options, confirm_depths(canonicalise(scene)[0]))
-    choices, num_blocks = choose_for_scene(size, options), choose_blocks(size, options)
-    limits, settings = choices.limits, choices.settings(options)
+    plan, num_blocks = plan_scene(size, options), choose_blocks(size, options)
+    limits, settings = plan.limits, plan.settings
     num_pixels = max(limits.num_pixels, scene.num_gaussians)
     max_count = num_pixels if options.method.startswith("unmerged") else limits.count or limits.default
     no_views = is_without_views(scene, options)
-    has_target = choices.keeps_fidelity or options.budget.target_psnr is not None
-    found_count = (
-        find_count(scene, options) if no_views and has_target and num_input <= MAX_SEARCHED_GAUSSIANS else None
-    )
+    has_target = plan.keeps_fidelity or options.budget.target_psnr is not None
+    found_count = None
+    if no_views and has_target and num_input <= MAX_SEARCHED_GAUSSIANS:  # estimates find it by the search of a run
+        with use_threads(options.threads), record_part(silent=True):
+            found_count = len(compact_scene(scene, options.with_settings({"levels": 1, "crop": None})).gaussians)
     count = found_count or min(scene.num_gaussians or num_pixels, max_count)
     at_once, num_rest = gaussians_at_once(num_pixels, num_blocks), 3 * scene.gaussians.shN.shape[1]
     num_drawn = num_pixels if options.method == "unmerged-fit" else count
-    fit = {OURS: choices.fit.fit, "unmerged-fit": "full"}.get(options.method, "none")
-    steps = 0 if fit == "none" else choices.fit.steps
+    fit = {OURS: plan.fit.fit, "unmerged-fit": "full"}.get(options.method, "none")
+    steps = 0 if fit == "none" else plan.fit.steps
     all_pixels, budget = at_once * num_blocks, options.budget  # a view that is in two blocks is built twice
-    inside = 1.0 if no_views else mean_inside(scene)
+    # the mean over all views of the share of the scene's Gaussians that lies in the view
+    inside = 1.0 if no_views else float(np.mean(shares_inside(scene, INSIDE_GAUSSIANS) or [1.0]))
+    has_curve = (budget.auto or budget.max_drop is not None) and not (has_target or size.rendered)
+    curve = curve_counts(budget.max_drop, limits.default, limits.min_count, limits.max_count) if has_curve else ([], 0)
     costs = RunCosts(
         settings=settings, num_pixels=all_pixels, view_pixels=all_pixels / max(1, len(scene)), inside=inside,
         steps=steps, merges_pairs=no_views, is_placed=no_views,
-        choice=CountChoice(
-            has_target=has_target, has_curve=budget.auto or budget.max_drop is not None, max_drop=budget.max_drop,
-            rendered=size.rendered,
-        ),
+        num_builds=usual_builds(has_target=has_target, rendered=size.rendered), curve=curve,
         has_trial=steps > 0 and scene.has_own_pixels and options.new_views is not False,
     )  # fmt: skip
-    seconds = costs.seconds(costs.all_parts(limits, num_drawn), len(scene), options.threads or available_threads())
+    coarser = level_counts(num_drawn, budget.levels, limits.min_count)
+    seconds = costs.seconds(num_drawn, coarser, len(scene), options.threads or available_threads())
     memory = memory_bytes(at_once, num_rest=num_rest, num_elsewhere=num_pixels - at_once)
     is_distributed = limits.count is not None or budget.auto
     return {
         "num_gaussians": count,
         "exact": options.budget.is_filled or found_count is not None,
-        "psnr_kept": FIDELITY_PSNR if choices.keeps_fidelity and size.rendered and found_count is None else None,
+        "psnr_kept": FIDELITY_PSNR if plan.keeps_fidelity and size.rendered and found_count is None else None,
         "quality": options.budget.quality if found_count is None else None,
-        "loss_kept": FIDELITY_LOSS if choices.keeps_fidelity and not size.rendered else None,
+        "loss_kept": FIDELITY_LOSS if plan.keeps_fidelity and not size.rendered else None,
         "ratio": count / max(1, num_input),
         "bytes": file_bytes(count, scene.gaussians.sh_degree),
         "blocks": num_blocks,
         "method": options.method,
-        "superpixels_per_view": 0 if choices.may_merge_pairs else None if is_distributed else limits.per_view,
+        "superpixels_per_view": 0 if plan.merges_pairs else None if is_distributed else limits.per_view,
         **{name: settings[name] for name in ("k", "match", "checkpoint")},
         "fit": fit,
-        "fit_steps": choices.fit.steps,
+        "fit_steps": plan.fit.steps,
         "seconds": float(f"{seconds:.2g}"),
         "memory_bytes": int(float(f"{memory:.2g}")),
         "memory_problem": memory_problem(memory),
@@ -130,7 +139,7 @@ def estimate_lines(run: Mapping[str, Any]) -> list[str]:
 
 
 def estimate_files(load: Loaded, settings: CompactOptions, outputs: Outputs) -> dict[str, Any]:
-    """Return the document of ``--dry-run``: what :func:`gsmerge.compaction.files.compact_files` would make."""
+    """Return the document of ``--dry-run``: what :func:`gsmerge.compaction.compact.compact_files` would make."""
     scene, out, settings = load.scene, outputs.result, with_output_name(settings, outputs)
     notes = [*load.notes, *views_notes(scene)]
     if os.path.lexists(out) and not outputs.overwrite:

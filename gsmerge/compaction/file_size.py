@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
-from gsmerge.compaction.candidate import Candidate, rescore
-from gsmerge.compaction.search import build_in_turn
+from gsmerge.compaction.candidate import Candidate, build_candidate, rescore
 from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import Prepared
 from gsmerge.io.formats.arrays import MIP_COMMENT, RESULT_COMMENT
 from gsmerge.io.formats.table import Contents, Format
 from gsmerge.plan import Plan
 from gsmerge.runtime.memory import human_bytes
+from gsmerge.runtime.record import add_seconds
 from gsmerge.stages.clean import faintest_dropped
 from gsmerge.types import Cameras, Gaussians
 
 BUILD_SURPLUS = 1.02  # Gaussians of a build, relative to the number that seems to fit
 MOST_MEASURED = 8  # most files that are measured to choose how many Gaussians are dropped
 MAX_REBUILDS = 2  # most builds after the first one
-
-BuildCandidate = Callable[[int | None], Candidate]  # build a count of Gaussians from all views, clean up and score them
 
 
 def measure_bytes(gaussians: Gaussians, file: Format, cameras: Cameras, names: Sequence[str] = ()) -> int:
@@ -35,16 +33,14 @@ def measure_bytes(gaussians: Gaussians, file: Format, cameras: Cameras, names: S
     return len(file.encode(gaussians, comments))
 
 
-def meet_bytes(candidate: Candidate, build_again: BuildCandidate, prepared: Prepared, plan: Plan) -> Candidate:
+def meet_bytes(candidate: Candidate, prepared: Prepared, plan: Plan) -> Candidate:
     """Make the file of a candidate nearly as large as a budget in bytes allows.
 
     The candidate is rebuilt with other counts until its file is about as large as allowed. The faintest Gaussians of
-    the last build are dropped until the file fits. The candidate is returned unchanged without a budget in bytes, or if
-    the format has a fixed number of bytes for each Gaussian.
+    the last build are dropped until the file fits.
     """
-    if plan.size is None or not plan.size.packed:
-        return candidate
-    max_bytes, file = plan.size.num_bytes, plan.size.file
+    assert plan.file_size is not None, "a budget in bytes"
+    max_bytes, file = plan.file_size.num_bytes, plan.file_size.file
     names = prepared.input_scene.names
     base_bytes = measure_least_bytes(candidate.gaussians, max_bytes, file, candidate.cameras, names)
 
@@ -63,7 +59,11 @@ def meet_bytes(candidate: Candidate, build_again: BuildCandidate, prepared: Prep
         is_small_enough = next_count >= (1 - most_dropped) * count
         return None if (is_large_enough and is_small_enough) or len(built) > MAX_REBUILDS else next_count
 
-    candidate = build_in_turn(build_again, candidate, choose_next)[-1]
+    built = [candidate]
+    while (count := choose_next(built)) is not None:
+        candidate = build_candidate(prepared, plan, count)
+        add_seconds(candidate.record.seconds)
+        built.append(candidate)
     gaussians = drop_to_bytes(candidate.gaussians, max_bytes, file, candidate.cameras, names, base_bytes)
     return candidate if len(gaussians) == len(candidate.gaussians) else rescore(candidate, gaussians, prepared, plan)
 

@@ -17,7 +17,6 @@ from gsmerge.raster.photos import NEAR_PLANE, Photos, scene_photos, score_photos
 from gsmerge.settings.compact import OURS, TRIAL, CompactOptions
 from gsmerge.types import Gaussians, PicturedScene
 
-LEAST_VIEWS = 4  # fewest views with photos of which some are left out; of fewer views, too little would remain
 # One of every LEFT_OUT_PART views is left out at a time, but at most MOST_LEFT_OUT views
 LEFT_OUT_PART, MOST_LEFT_OUT = 6, 3
 LEAST_SEEN = 0.02  # a left-out photo counts if the other views see more than this share of it
@@ -59,7 +58,7 @@ class LeftOut:
         settings = plan.settings | TRIAL | settings
         # without networks in the plan, the settings must not ask for any
         settings |= {"method": OURS, "checkpoint": "none"} if plan.checkpoint is None else {}
-        return make_plan(self.rest, CompactOptions().with_settings(settings), plan.checkpoint)
+        return make_plan(self.rest, CompactOptions().with_settings(settings), plan.checkpoint, plan.run)
 
 
 def leave_out(scene: PicturedScene, views: Sequence[int], prepared: Prepared) -> LeftOut | None:
@@ -94,13 +93,6 @@ def choose_left_out(views: Sequence[int]) -> tuple[list[int], list[int]]:
     count = min(MOST_LEFT_OUT, max(1, len(views) // LEFT_OUT_PART))
     spread = [views[i] for i in pick_views(len(views), 2 * count)]
     return spread[::2], spread[1::2]
-
-
-def can_leave_out(prepared: Prepared) -> bool:
-    """Return whether some views can be left out: enough views have photos, and each Gaussian comes from one view."""
-    reference = prepared.reference
-    has_photos = reference.name == PHOTOS and len(reference.score_views) >= LEAST_VIEWS
-    return has_photos and prepared.scene.has_own_pixels
 
 
 def mark_seen(rest: PicturedScene, views: PicturedScene) -> np.ndarray:

@@ -11,8 +11,6 @@ from functools import partial
 
 from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import Prepared, prepare
-from gsmerge.fit import Fitted
-from gsmerge.pipeline import build
 from gsmerge.plan import Plan
 from gsmerge.runtime.plugins import METHODS, load_plugin
 from gsmerge.runtime.record import note
@@ -32,7 +30,7 @@ class Method:
         name: The name on the command line.
         run: A function of a prepared scene, a plan and a number of Gaussians. The function returns at most this number
             of canonical Gaussians, unless the method keeps the Gaussians of the input. The function's parts are blocks
-            of :func:`gsmerge.runtime.record.stage`, which measures their time.
+            of :func:`gsmerge.runtime.record.stage`, which measures their time. None: gsmerge's own stages.
         needs_photos: The scene must have photos.
         uses: Flat names of the settings that it uses, besides the settings that all methods use.
         check: Raises a UsageError if a program that the method runs is missing.
@@ -40,28 +38,14 @@ class Method:
     """
 
     name: str
-    run: Callable[[Prepared, Plan, int], Gaussians]
+    run: Callable[[Prepared, Plan, int], Gaussians] | None
     needs_photos: bool = False
     uses: tuple[str, ...] = COUNTS
     check: Callable[[], object] = lambda: None
     prepare: Callable[[Scene, PrepareOptions], Prepared] = prepare
 
-    def build(self, prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
-        """Build ``count`` canonical Gaussians by ``run``; None: ``superpixels`` and K decide the number."""
-        gaussians = self.run(prepared, plan, plan.limits.default if count is None else count)
-        return Fitted(gaussians, prepared.scene.cameras, None)
 
-
-@dataclass(frozen=True)
-class _OwnMethod(Method):
-    """The method of gsmerge: the pipeline of :mod:`gsmerge.pipeline`, which also fits the Gaussians."""
-
-    def build(self, prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
-        """Build and fit ``count`` canonical Gaussians."""
-        return build(prepared, plan, count)
-
-
-OWN_METHOD = _OwnMethod(OURS, lambda *arguments: build(*arguments).gaussians)
+OWN_METHOD = Method(OURS, None)
 
 
 def find_method(options: CompactOptions) -> Method:
@@ -92,9 +76,9 @@ def choose_method(options: CompactOptions, scene: Scene) -> Method:
         if unused:
             note(f"these settings have no effect without cameras: {', '.join(unused)}")
         return replace(OWN_METHOD, prepare=partial(prepare, pixels=False))
+    if options.method == OURS:
+        return OWN_METHOD
     method = find_method(options)
-    if method is OWN_METHOD:
-        return method
     place = f"method {method.name}"
     if method.needs_photos and not scene.is_shown:
         raise UsageError(f"{place}: expected photos, found none; give --images, or another method")

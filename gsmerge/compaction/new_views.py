@@ -8,20 +8,20 @@ the Gaussians of the other views before and after compaction, over the pixels th
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsmerge.compaction.left_out import LEAST_SEEN, can_leave_out, choose_left_out, leave_out, mean_seen
+from gsmerge.compaction.left_out import LEAST_SEEN, choose_left_out, leave_out, mean_seen
+from gsmerge.compaction.report import CompactReport, NewViews, compared_psnr
 from gsmerge.facts.prepare import Prepared
 from gsmerge.geometry.transforms import camera_distances
-from gsmerge.io.formats.arrays import ExpectedScores
 from gsmerge.kernels.elementary import power
 from gsmerge.photos.views import subset
-from gsmerge.pipeline import Build
+from gsmerge.pipeline import build
 from gsmerge.plan import Plan
 from gsmerge.raster.photos import shrink_pictures
-from gsmerge.runtime.record import add_seconds, begin_part, record_part
+from gsmerge.runtime.record import begin_part, record_part
 from gsmerge.settings.budget import parse_share
 from gsmerge.settings.stages import SHARE
 from gsmerge.types import Cameras, PicturedScene, Pixels
@@ -44,22 +44,6 @@ USUAL_DENSITY, SHARE_POWER = parse_share(SHARE), 0.3
 # others, the true gain of at least 80 % of the results lies between these two gains, or at most SPREAD dB outside of
 # them (docs/internals/notebook.md). Nothing is known about results with more than MOST_SHARE Gaussians for each pixel
 OWN_WEIGHT, SPREAD, MOST_SHARE = 0.2, 1.25, 0.1
-
-
-@dataclass(frozen=True)
-class NewViews(ExpectedScores):
-    """Expected PSNR (dB) of new views of a scene, as a trial predicts it."""
-
-    views: int  # Number of left-out photos on which the trial measured
-
-    @property
-    def gain(self) -> float:
-        """Gain of PSNR (dB) of a new view."""
-        return self.after - self.before
-
-    def to_dict(self) -> dict[str, float]:
-        """Return the numbers, rounded for a report, by name."""
-        return {name: round(value, 4) for name, value in asdict(self).items()}
 
 
 @dataclass(frozen=True)
@@ -87,29 +71,42 @@ class Trial:
         return NewViews(round(before, 2), round(after, 2), low, high, self.views)
 
 
-def can_try(prepared: Prepared, count: int = 0) -> bool:
-    """Return whether a trial is possible for a scene, and allows a prediction for a result of ``count`` Gaussians."""
-    pixels = prepared.scene.pixels_per_view * len(prepared.scene)
-    return prepared.agreement is not None and can_leave_out(prepared) and count <= MOST_SHARE * pixels
+def expect_new_views(report: CompactReport, prepared: Prepared, plan: Plan) -> CompactReport:
+    """Return the report with the PSNR of new views that a trial predicts.
+
+    The report is returned without a prediction if the result has too many Gaussians for a trial, or no scores. It gets
+    a doubt if new views of the result are expected to be worse than those of the input, unless it says already that the
+    result is worse.
+    """
+    with record_part(silent=True) as record:
+        trial = try_new_views(prepared, plan, report.num_output)
+    report = replace(report, seconds=report.seconds | {"new views": sum(record.seconds.values())})
+    before, after = compared_psnr(report.covered, report.psnr_before, report.psnr_after)
+    if trial is None or prepared.agreement is None or before is None or after is None:
+        return report
+    expected = trial.predict(before, after, prepared.agreement.confirmed)
+    report = replace(report, new_views=expected)
+    # a trial on very small pictures says too little for a warning
+    is_large = max(prepared.scene.cameras.width, prepared.scene.cameras.height) >= TRIAL_PIXELS
+    if not is_large or report.worse is not None or expected.gain >= -SPREAD:
+        return report
+    return report.with_worse(
+        f"new views of the result are expected to be {-expected.gain:.1f} dB worse than those of the input"
+    )
 
 
-def try_new_views(prepared: Prepared, plan: Plan, build: Build, count: int) -> Trial | None:
+def try_new_views(prepared: Prepared, plan: Plan, count: int) -> Trial | None:
     """Run the trial for a result of ``count`` Gaussians, in two rounds, and return what it measured.
 
-    None if the plan wants no trial, with too few photos, or with too many Gaussians. None also unless each Gaussian
-    comes from one view, because the Gaussians would otherwise keep the content of the left-out photos. A trial in which
-    they keep it has an error of 2 dB instead of 1.2 dB, and takes a quarter of a run's time.
+    None if a trial could not predict a result of so many Gaussians, or if no view sees what left-out photos show.
     """
-    if not plan.new_views or not can_try(prepared, count):
-        return None
     pixels = prepared.scene.pixels_per_view * len(prepared.scene)
-    begin_part()
-    with record_part(silent=True) as record:
-        share = min(1.0, USUAL_DENSITY * float(power(count / (USUAL_DENSITY * pixels), SHARE_POWER)))
-        views_of_rounds = choose_left_out(prepared.reference.score_views)
-        rounds = [_score_round(prepared, views, plan, build, share) for views in views_of_rounds]
-        scores = [round_scores for round_scores in rounds if round_scores is not None]
-    add_seconds({"new views": sum(record.seconds.values())})
+    if count > MOST_SHARE * pixels:
+        return None
+    share = min(1.0, USUAL_DENSITY * float(power(count / (USUAL_DENSITY * pixels), SHARE_POWER)))
+    views_of_rounds = choose_left_out(prepared.reference.score_views)
+    rounds = [_score_round(prepared, views, plan, share) for views in views_of_rounds]
+    scores = [round_scores for round_scores in rounds if round_scores is not None]
     if not scores:
         return None
     shares, *psnrs = np.concatenate(scores, 1)
@@ -117,7 +114,7 @@ def try_new_views(prepared: Prepared, plan: Plan, build: Build, count: int) -> T
     return Trial(own, before, after, int((shares > LEAST_SEEN).sum()))
 
 
-def _score_round(prepared: Prepared, views: Sequence[int], plan: Plan, build: Build, share: float) -> np.ndarray | None:
+def _score_round(prepared: Prepared, views: Sequence[int], plan: Plan, share: float) -> np.ndarray | None:
     """Leave out ``views``, compact other views near them at a small size, and score the result on the left-out photos.
 
     ``share`` is the number of Gaussians per pixel. Returns an array ``[4,v]``, whose rows are the share of each photo
@@ -130,6 +127,7 @@ def _score_round(prepared: Prepared, views: Sequence[int], plan: Plan, build: Bu
     left_out = leave_out(small, [used_views.index(view) for view in views], prepared)
     if left_out is None:
         return None
+    begin_part("trial")
     superpixels = max(1, round(share * small.pixels_per_view))
     trial_plan = left_out.plan(plan, superpixels=superpixels, k=1, fit_steps=min(TRIAL_STEPS, plan.fit.steps))
     # The fit draws no views from outside, and nothing is pruned. Views from outside and pruning hardly change the score

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from gsmerge.compaction.new_views import NewViews
 from gsmerge.errors import Doubt, list_doubts
+from gsmerge.io.formats.arrays import ExpectedScores
 from gsmerge.measure.documents import document_head, note_entries, seconds_document, seconds_line, text_table, wrap_line
 from gsmerge.raster.metrics import psnr_figure, psnr_words
 from gsmerge.runtime.memory import human_bytes, human_share
@@ -54,6 +54,22 @@ class PhotoFiles:
 
     before: float
     after: float
+
+
+@dataclass(frozen=True)
+class NewViews(ExpectedScores):
+    """Expected PSNR (dB) of new views of a scene, as a trial predicts it."""
+
+    views: int  # Number of left-out photos on which the trial measured
+
+    @property
+    def gain(self) -> float:
+        """Gain of PSNR (dB) of a new view."""
+        return self.after - self.before
+
+    def to_dict(self) -> dict[str, float]:
+        """Return the numbers, rounded for a report, by name."""
+        return {name: round(value, 4) for name, value in asdict(self).items()}
 
 
 @dataclass(frozen=True)
@@ -124,6 +140,10 @@ class CompactReport:
     def doubts(self) -> list[str]:
         """The notes that make the result doubtful."""
         return list_doubts(self.notes)
+
+    def with_worse(self, worse: str) -> CompactReport:
+        """Return the report with the doubt ``worse``, which says that the result is worse than its input."""
+        return replace(self, notes=[*self.notes, Doubt(worse)], worse=worse)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the report as plain JSON types, by the names of its fields, with ``doubts``."""

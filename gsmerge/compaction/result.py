@@ -7,16 +7,16 @@ from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from weakref import ReferenceType
+from weakref import ReferenceType, ref
+
+import numpy as np
 
 from gsmerge.compaction.candidate import Candidate, rescore, with_moved_views
 from gsmerge.compaction.distance import describe_clear_loss, is_clearly_worse
-from gsmerge.compaction.new_views import SPREAD, TRIAL_PIXELS, NewViews, Trial
 from gsmerge.compaction.outputs import name_outputs, write_outputs
+from gsmerge.compaction.placement import NUM_FULL, pad_harmonics
 from gsmerge.compaction.report import CompactReport, compared_psnr
 from gsmerge.compaction.scores import PartScores, measure_parts, score_input
-from gsmerge.compaction.search import SearchFacts
-from gsmerge.errors import Doubt
 from gsmerge.facts.prepare import Prepared
 from gsmerge.io.formats.arrays import result_comments
 from gsmerge.io.formats.table import Contents
@@ -24,7 +24,6 @@ from gsmerge.photos.row_colors import OWN_PHOTOS, PHOTOS, RENDERS
 from gsmerge.plan import Plan, own_views
 from gsmerge.raster.metrics import SAMPLE_LOSS, describe_distance, describe_loss, is_worse
 from gsmerge.runtime.memory import peak_memory
-from gsmerge.runtime.record import current_record
 from gsmerge.types import Cameras, Gaussians, Scene, StrPath, make_scene, number_views
 from gsmerge.values.arguments import check_arguments
 from gsmerge.values.arrays import to_float32
@@ -119,6 +118,18 @@ class CompactResult:
         coarser = tuple(level.to_single() for level in self.coarser)
         return replace(self, gaussians=replace(self.gaussians, means=to_float32(self.gaussians.means)), coarser=coarser)
 
+    def pad_to_full(self) -> CompactResult:
+        """Return the same result with harmonics of degree 3, padded with zeros."""
+        coarser = tuple(level.pad_to_full() for level in self.coarser)
+        return replace(self, gaussians=pad_harmonics(self.gaussians, NUM_FULL), coarser=coarser)
+
+    def for_scene(self, scene: Scene) -> CompactResult:
+        """Return the result of a scene in memory: with arrays of the scene's kind, and a weak reference to it."""
+        result, means = self.to(scene.gaussians.device), scene.gaussians.means
+        if isinstance(means, np.ndarray) and means.dtype == np.float32:
+            result = result.to_single()
+        return replace(result, scene=ref(scene), names=scene.names)
+
     def to(self, device: torch.device | str | None) -> CompactResult:
         """Return the same result with tensors on a device, or unchanged if the device is None."""
         if device is None:
@@ -127,21 +138,13 @@ class CompactResult:
         return replace(self, gaussians=self.gaussians.to(device), coarser=coarser)
 
 
-def make_result(
-    best: Candidate,
-    levels: Sequence[Candidate],
-    prepared: Prepared,
-    plan: Plan,
-    search: SearchFacts,
-    trial: Trial | None = None,
-) -> CompactResult:
+def make_result(best: Candidate, levels: Sequence[Candidate], prepared: Prepared, plan: Plan) -> CompactResult:
     """Make the result from the best candidate and its coarser levels of detail, with a report.
 
     The input is scored here, when memory is free again, unless the plan has its score. Scores may come from a sample of
     the photos. If a sample shows that a result may be worse than the input, this function starts again with all photos.
-    The report contains the seconds, choices and notes of the current record, of the search and of the candidates.
+    The report contains the seconds, choices and notes of the current record, and those of a level its own.
     """
-    run = current_record()
     input_scores, candidates = score_input(prepared, plan), (best, *levels)
     before = None if input_scores.photos is None else input_scores.photos.psnr
     part_scores = [
@@ -154,18 +157,12 @@ def make_result(
     ):
         plan = replace(plan, scored_views=own_views(prepared), samples=False)
         best, *levels = (rescore(candidate, candidate.gaussians, prepared, plan) for candidate in candidates)
-        return make_result(best, levels, prepared, plan, search, trial)
-    stage_names = {**run.seconds, **search.seconds}
-    seconds = {name: run.seconds.get(name, 0.0) + search.seconds.get(name, 0.0) for name in stage_names}
+        return make_result(best, levels, prepared, plan)
+    seconds = dict(best.record.seconds)
     if "input" in seconds:
         seconds["input"] = seconds.pop("input")  # moved to the end, since the input is scored last
     report = _report(best, prepared, plan, before, part_scores[0], seconds, 0)
-    new_views, worse = _expect_new_views(report, prepared, trial)
-    report = report if worse is None else with_worse(report, worse)
-    report = replace(
-        report, choices=run.choices | report.choices | search.choices,
-        notes=[*run.notes, *search.notes, *report.notes], unmet=search.unmet, new_views=new_views,
-    )  # fmt: skip
+    report = replace(report, unmet=best.unmet)
     coarser = tuple(
         CompactResult(
             candidate.gaussians,
@@ -201,7 +198,7 @@ def _report(
     if prepared.doubt is not None:  # the photos do not fit the scene, so the report has no scores
         choices = {key: value for key, value in record.choices.items() if key != "fidelity"}
         report = replace(report, psnr_before=None, psnr_after=None, **vars(PartScores()), choices=choices)
-        return with_worse(report, prepared.doubt)
+        return report.with_worse(prepared.doubt)
     worse = None
     if rendered and level == 0 and not plan.clean.visible_drops:  # coarser levels are meant to differ
         worse = describe_distance(candidate.psnr)
@@ -211,28 +208,4 @@ def _report(
         clear_loss = describe_clear_loss(candidate.fitted.gaussians, prepared) if level == 0 else None
         report = replace(report, is_far=clear_loss is not None or is_clearly_worse(*compared))
         worse = describe_loss(name, *compared, OWN_PHOTOS if pictures == PHOTOS else pictures) or clear_loss
-    return report if worse is None else with_worse(report, worse)
-
-
-def with_worse(report: CompactReport, worse: str) -> CompactReport:
-    """Return a report with the doubt ``worse``, which says that the result is worse than its input."""
-    return replace(report, notes=[*report.notes, Doubt(worse)], worse=worse)
-
-
-def _expect_new_views(
-    report: CompactReport, prepared: Prepared, trial: Trial | None
-) -> tuple[NewViews | None, str | None]:
-    """Return the PSNR of new views that a trial predicts, and a warning if the result is expected to be worse there.
-
-    The PSNR is None without a trial or without scores. The warning is also None if the report already says that the
-    result is worse.
-    """
-    before, after = compared_psnr(report.covered, report.psnr_before, report.psnr_after)
-    if trial is None or prepared.agreement is None or before is None or after is None:
-        return None, None
-    expected = trial.predict(before, after, prepared.agreement.confirmed)
-    # a trial on very small pictures says too little for a warning
-    is_large = max(prepared.scene.cameras.width, prepared.scene.cameras.height) >= TRIAL_PIXELS
-    if not is_large or report.worse is not None or expected.gain >= -SPREAD:
-        return expected, None
-    return expected, f"new views of the result are expected to be {-expected.gain:.1f} dB worse than those of the input"
+    return report if worse is None else report.with_worse(worse)

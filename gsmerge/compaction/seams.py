@@ -40,7 +40,7 @@ def fit_seams(joined: Gaussians, owners: np.ndarray, starts: Sequence[BlockStart
     plan = next((start.plan for start in starts if start.plan.fit.fit != "none"), None)
     if plan is None:
         return joined
-    begin_part()
+    begin_part("seams")
     with stage("join"):
         at_seam, views = find_seams(joined, owners, starts)
         if not any(views):

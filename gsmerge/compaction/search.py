@@ -2,20 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, TypeVar
+from typing import Any
 
-from gsmerge.compaction.candidate import Candidate
+from gsmerge.compaction.candidate import Candidate, build_candidate, score
+from gsmerge.compaction.clean_up import clean_fitted, record_dropped
+from gsmerge.compaction.costs import STAGE_STEPS, run_parts
 from gsmerge.compaction.curve import count_reaching, count_within, curve_counts, curve_knee, measure_curve
-from gsmerge.compaction.left_out import LEAST_VIEWS, LeftOut, can_leave_out, choose_left_out, leave_out, mean_seen
+from gsmerge.compaction.file_size import meet_bytes
+from gsmerge.compaction.left_out import LeftOut, choose_left_out, leave_out, mean_seen
 from gsmerge.compaction.scores import compares_all_pixels, may_leave_gaps, measure_input, measure_renders
-from gsmerge.facts.prepare import Prepared
+from gsmerge.facts.counts import level_counts
+from gsmerge.facts.prepare import LEAST_VIEWS, Prepared
 from gsmerge.kernels.elementary import exp, log, power
 from gsmerge.photos.row_colors import PHOTOS, RENDERS
-from gsmerge.pipeline import Build
+from gsmerge.pipeline import build
 from gsmerge.plan import FIDELITY_LOSS, Plan
-from gsmerge.runtime.record import begin_part, current_record, note, record_choices, record_part, stage
+from gsmerge.runtime.record import (
+    RunPart,
+    add_seconds,
+    adopt,
+    begin_part,
+    current_record,
+    expect_parts,
+    note,
+    record_choices,
+    record_part,
+    stage,
+)
+from gsmerge.settings.stages import CleanOptions
 from gsmerge.stages.segment import knee_count
 
 # The slope is the gain of PSNR (dB) per doubling of the count. Until two counts were built, a search assumes these
@@ -35,53 +51,106 @@ MAX_LEFT_OUT_BUILDS = 3  # most builds of a search by left-out photos, in additi
 # that of the whole input, says little about the slope near the target
 FAR_DB = 6.0
 
-T = TypeVar("T")
 
+def search_count(prepared: Prepared, plan: Plan) -> Candidate:
+    """Build results of several counts, and return the one that the plan asks for.
 
-def build_in_turn(build: Callable[[int], T], first: T, choose_next: Callable[[list[T]], int | None]) -> list[T]:
-    """Build one candidate after another, and return all of them; ``first`` is built already.
-
-    ``choose_next`` gets all candidates so far, and returns the next count, or None to end.
+    The count is the one at which a PSNR is reached, or the one that the scene's curve or a size of the file allows.
+    Seconds, choices and notes of the search, and of the result, are recorded.
     """
-    built = [first]
-    while (count := choose_next(built)) is not None:
-        built.append(build(count))
-    return built
+    if plan.target_psnr is not None:
+        best = _reach_target(prepared, plan)
+    else:
+        best = build_candidate(prepared, plan, choose_count(prepared, plan))
+        add_seconds(best.record.seconds)
+    if plan.file_size is not None and plan.file_size.packed:
+        best = meet_bytes(best, prepared, plan)
+    adopt(best.record)
+    return replace(best, record=current_record())
 
 
-@dataclass(frozen=True)
-class SearchFacts:
-    """What a search adds to the report of a run."""
+def _reach_target(prepared: Prepared, plan: Plan) -> Candidate:
+    """Build one count after another until the target is reached, and return the best result.
 
-    seconds: dict[str, float]  # Wall time by stage, of all candidates
-    choices: dict[str, Any]
-    notes: list[str]
-    unmet: str | None  # Why the target is not met; None if it is met, or without a target
+    With left-out photos, what is built during the search lacks these photos, so the best count is built again. If the
+    quality of the input is kept, only the best result is cleaned up, because what clean-up leaves out would count as
+    errors.
+    """
+    left_out = leave_out_for_scores(prepared, plan)
+    is_cleaned_last = plan.keeps_fidelity and plan.clean.asked and left_out is None
+    tried_plan = plan if left_out is None else left_out.plan(plan)
+    if is_cleaned_last:
+        tried_plan = replace(plan, clean=CleanOptions())
+    candidates = dict[int, Candidate]()
+
+    def measure(count: int) -> float:
+        """Build a result with ``count`` Gaussians, and return the PSNR (dB) that decides about it."""
+        if left_out is not None:
+            return score_left_out(left_out, tried_plan, count)
+        candidates[count] = candidate = build_candidate(prepared, tried_plan, count)
+        add_seconds(candidate.record.seconds)
+        return candidate.deciding_psnr or 0.0
+
+    limits, most = plan.limits, most_useful(prepared, plan, left_out)
+    first = min(max(limits.default, limits.min_count), most)
+    search = CountSearch(plan, first, prepared.reference.name == RENDERS, left_out, most)
+    search.run(measure)
+    if left_out is not None:
+        best = build_candidate(prepared, plan, search.count)
+        add_seconds(best.record.seconds)
+    else:
+        best = candidates[search.best]
+    for text in search.notes(len(best.gaussians)):
+        note(text)
+    if is_cleaned_last:
+        with record_part() as record:
+            adopt(best.record)
+            gaussians, dropped = clean_fitted(best.fitted, prepared, plan)
+            record_dropped(dropped, len(gaussians), None, prepared)
+            best = score(replace(best.fitted, gaussians=gaussians), prepared, plan)
+        add_seconds(record.seconds)
+    best.record.choices["search"] = search.choices
+    return replace(best, unmet=search.describe_unmet(len(best.gaussians)))
+
+
+def build_levels(best: Candidate, prepared: Prepared, plan: Plan) -> list[Candidate]:
+    """Build the coarser levels of detail of a result, which keep the cameras that the result has."""
+    prepared, plan = prepared.with_cameras(best.fitted.cameras), plan.with_fixed_cameras()
+    counts = level_counts(len(best.gaussians), plan.levels, plan.limits.min_count)
+    return [build_candidate(prepared, plan, count) for count in counts]
+
+
+def most_useful(prepared: Prepared, plan: Plan, left_out: LeftOut | None) -> int:
+    """Return the largest count of a search, above which left-out photos gain nothing."""
+    limits, agreement = plan.limits, prepared.agreement
+    if left_out is None or agreement is None:
+        return limits.max_count
+    return max(limits.min_count, min(limits.max_count, int(agreement.share * limits.num_pixels)))
 
 
 @dataclass(eq=False)
 class CountSearch:
-    """Search for the number of Gaussians: the search builds one count, or several until a quality is met."""
+    """Search for the number of Gaussians at which a PSNR is reached, by building one count after another."""
 
     plan: Plan  # Has the target and the limits
-    first: int | None  # The first count to build; None: as many as `superpixels` and K give
-    rendered: bool = False  # Candidates are scored on renders of the input, which more Gaussians always show better
-    left_out: LeftOut | None = None  # Photos for scores, which fits of candidates leave out; None: all views score
+    first: int  # The first count to build
+    rendered: bool = False  # Results are scored on renders of the input, which more Gaussians always show better
+    left_out: LeftOut | None = None  # Photos for scores, which the fits leave out; None: all views score
     most: int | None = None  # Count above which left-out photos gain nothing; None: only the plan has a limit
-    candidates: list[Candidate] = field(default_factory=list)  # Candidates built so far
+    psnrs: dict[int, float] = field(default_factory=dict)  # PSNR (dB) by count, in the order of the builds
 
-    def run(self, build: Callable[[int | None], Candidate]) -> None:
-        """Build a candidate for each count that the search chooses."""
-        self.candidates = build_in_turn(build, build(self.first), self.choose_next)
+    @property
+    def target(self) -> float:
+        """PSNR (dB) to reach."""
+        assert self.plan.target_psnr is not None
+        return self.plan.target_psnr
 
-    def choose_next(self, candidates: Sequence[Candidate]) -> int | None:
-        """Choose the next count by the candidates built so far; None ends the search."""
-        target = self.plan.target_psnr
-        if target is None or len(candidates) >= (MAX_BUILDS if self.left_out is None else MAX_LEFT_OUT_BUILDS):
-            return None
-        psnrs = psnr_by_count(candidates)
-        count = next_count(psnrs, target, *self._allowed_counts(), *self._slope_and_tolerance())
-        return None if count in psnrs else count
+    def run(self, measure: Callable[[int], float]) -> None:
+        """Measure the PSNR (dB) of each count that the search chooses."""
+        count, most_builds = self.first, MAX_BUILDS if self.left_out is None else MAX_LEFT_OUT_BUILDS
+        while count not in self.psnrs and len(self.psnrs) < most_builds:
+            self.psnrs[count] = measure(count)
+            count = next_count(self.psnrs, self.target, *self._allowed_counts(), *self._slope_and_tolerance())
 
     def _allowed_counts(self) -> tuple[int, int]:
         """Return the fewest and the most Gaussians that a candidate may have, by the limits and the kind of search."""
@@ -108,72 +177,62 @@ class CountSearch:
         return PHOTOS_SLOPE, PHOTOS_NEAR_DB if self.plan.keeps_fidelity else 0.0
 
     @property
-    def psnrs(self) -> dict[int, float]:
-        """PSNR (dB) of the candidates by count, in the order in which they were built."""
-        return psnr_by_count(self.candidates)
-
-    @property
-    def count(self) -> int | None:
-        """The number of Gaussians that the search has chosen, which is usually the number of the best candidate.
-
-        With left-out photos, it is the number at which the PSNR of these photos reaches the target. This number may lie
-        between the counts of two candidates.
-        """
-        if self.plan.target_psnr is None or self.left_out is None:
-            return self.best.count
-        return count_reaching(sorted(self.psnrs.items()), self.plan.target_psnr) if self.is_met else self.best.count
-
-    @property
-    def best(self) -> Candidate:
-        """The candidate with the fewest Gaussians that reaches the target; if none does, the one with the highest PSNR.
-
-        Without a target there is only one candidate.
-        """
-        if self.plan.target_psnr is None:
-            return self.candidates[0]
-        psnrs, target = self.psnrs, self.plan.target_psnr
-        enough = [count for count, psnr in psnrs.items() if psnr >= target]
-        best_count = min(enough) if enough else max(psnrs, key=lambda count: psnrs[count])
-        return next(candidate for candidate in self.candidates if candidate.count == best_count)
+    def best(self) -> int:
+        """The fewest Gaussians that reach the target; if no count does, the count with the highest PSNR."""
+        enough = [count for count, psnr in self.psnrs.items() if psnr >= self.target]
+        return min(enough) if enough else max(self.psnrs, key=lambda count: self.psnrs[count])
 
     @property
     def is_met(self) -> bool:
-        """Return whether there is a target and a candidate reaches it."""
-        return self.plan.target_psnr is not None and max(self.psnrs.values()) >= self.plan.target_psnr
-
-    def facts(self, result: Candidate) -> SearchFacts:
-        """Return what the report says about the search; ``result`` is the final candidate, built after the search."""
-        names = dict.fromkeys(name for run in self.candidates for name in run.record.seconds)
-        seconds = {name: sum(run.record.seconds.get(name, 0.0) for run in self.candidates) for name in names}
-        target = self.plan.target_psnr
-        if target is None:
-            return SearchFacts(seconds, {}, self.notes, None)
-        best, met, left_out = self.best, self.is_met, 0 if self.left_out is None else len(self.left_out.photos)
-        # if the count lies between the counts of two candidates, its PSNR is expected to be the target
-        psnr = best.deciding_psnr if self.count == best.count else target
-        choices: dict[str, Any] = {
-            "search": {
-                "count": self.count, "psnr": psnr, "met": met, "tried": tuple(self.psnrs.items()), "left_out": left_out,
-            }
-        }  # fmt: skip
-        views = "photos left out" if left_out else "the input views"
-        reached = f"{views} reach {psnr or 0.0:.2f} dB with {len(result.gaussians):,} Gaussians"
-        notes, unmet = self.notes, None
-        if left_out and met:
-            notes = [*notes, f"quality: {reached}"]
-        elif not met and not self.plan.keeps_fidelity:
-            unmet = f"quality: {target:g} dB was asked for; {reached}, the best that was tried"
-        return SearchFacts(seconds, choices, notes, unmet)
+        """Return whether the best count reaches the target."""
+        return self.psnrs[self.best] >= self.target
 
     @property
-    def notes(self) -> list[str]:
-        """A note, if keeping the quality of the input takes more Gaussians than usual; otherwise empty."""
-        count, limits = self.best.count or 0, self.plan.limits
+    def count(self) -> int:
+        """The number of Gaussians that the search has chosen, which is usually the best of the counts.
+
+        With left-out photos, it is the number at which the PSNR of these photos reaches the target. This number may lie
+        between two counts.
+        """
+        if self.left_out is None or not self.is_met:
+            return self.best
+        return count_reaching(sorted(self.psnrs.items()), self.target)
+
+    @property
+    def psnr(self) -> float:
+        """PSNR (dB) of the chosen number; between two counts, the target is expected."""
+        return self.psnrs.get(self.count, self.target)
+
+    @property
+    def choices(self) -> dict[str, Any]:
+        """What a report says about the search."""
+        num_left_out = 0 if self.left_out is None else len(self.left_out.photos)
+        return {
+            "count": self.count, "psnr": self.psnr, "met": self.is_met, "tried": tuple(self.psnrs.items()),
+            "left_out": num_left_out,
+        }  # fmt: skip
+
+    def describe_unmet(self, num_gaussians: int) -> str | None:
+        """Say that a result of ``num_gaussians`` misses a target that was asked for; None if it does not."""
+        if self.is_met or self.plan.keeps_fidelity:
+            return None
+        reached = self._describe_reached(num_gaussians)
+        return f"quality: {self.target:g} dB was asked for; {reached}, the best that was tried"
+
+    def _describe_reached(self, num_gaussians: int) -> str:
+        """Say which PSNR a result of ``num_gaussians`` reaches."""
+        views = "the input views" if self.left_out is None else "photos left out"
+        return f"{views} reach {self.psnr:.2f} dB with {num_gaussians:,} Gaussians"
+
+    def notes(self, num_gaussians: int) -> list[str]:
+        """Return a note if keeping the quality of the input takes more Gaussians than usual, or what photos gain."""
+        count, limits = self.best, self.plan.limits
         if not self.plan.keeps_fidelity or count <= limits.default:
-            return []
-        kept = f"kept {len(self.best.gaussians):,} of {limits.num_input:,} Gaussians"
-        miss = f"be below {self.plan.target_psnr:g} dB from it"
-        reach = f"are {self.plan.target_psnr:g} dB from the input or better"
+            is_told = self.left_out is not None and self.is_met
+            return [f"quality: {self._describe_reached(num_gaussians)}"] if is_told else []
+        kept = f"kept {num_gaussians:,} of {limits.num_input:,} Gaussians"
+        miss = f"be below {self.target:g} dB from it"
+        reach = f"are {self.target:g} dB from the input or better"
         if not self.rendered:
             miss = f"show the photos over {FIDELITY_LOSS:g} dB worse"
             reach = f"show the photos at most {FIDELITY_LOSS:g} dB worse than the input"
@@ -183,15 +242,6 @@ class CountSearch:
         if count > compact_share * limits.num_input:
             return [f"the scene is compact already: {kept}, since fewer would {miss}"]
         return [f"{kept}, about the fewest that {reach}"]
-
-
-def psnr_by_count(candidates: Sequence[Candidate]) -> dict[int, float]:
-    """Return the PSNR (dB) that decides about each candidate, by its count, in the order of the candidates."""
-    psnrs = dict[int, float]()
-    for candidate in candidates:
-        if candidate.count is not None:
-            psnrs[candidate.count] = candidate.deciding_psnr or 0.0
-    return psnrs
 
 
 def add_target(plan: Plan, prepared: Prepared) -> Plan:
@@ -212,22 +262,6 @@ def add_target(plan: Plan, prepared: Prepared) -> Plan:
     return replace(plan, before=before, target_psnr=psnr - FIDELITY_LOSS)
 
 
-def search_count(prepared: Prepared, plan: Plan, build: Build) -> CountSearch:
-    """Return the search for the number of Gaussians, before its first build.
-
-    Without a quality target, the search builds one count only. If the scene's curve decides the number, the curve is
-    measured here.
-    """
-    limits, left_out = plan.limits, leave_out_for_scores(prepared, plan)
-    agreement, most = prepared.agreement, limits.max_count
-    if left_out is not None and agreement is not None:  # left-out photos gain nothing from more Gaussians than this
-        most = max(limits.min_count, min(most, int(agreement.share * limits.num_pixels)))
-    if plan.target_psnr is None:
-        return CountSearch(plan, choose_count(prepared, plan, build, left_out, most))
-    first = min(max(limits.default, limits.min_count), most)
-    return CountSearch(plan, first, prepared.reference.name == RENDERS, left_out, most)
-
-
 def leave_out_for_scores(prepared: Prepared, plan: Plan) -> LeftOut | None:
     """Leave out views, so that their photos can score candidates or a curve; None if no view is left out.
 
@@ -237,7 +271,7 @@ def leave_out_for_scores(prepared: Prepared, plan: Plan) -> LeftOut | None:
     has_target = plan.target_psnr is not None and not plan.keeps_fidelity
     if plan.fit.fit == "none" or not (has_target or plan.max_drop is not None or plan.auto_count):
         return None
-    if can_leave_out(prepared):
+    if prepared.can_leave_out:
         for views in choose_left_out(prepared.reference.score_views):
             if left_out := leave_out(prepared.scene, views, prepared):
                 return left_out
@@ -250,35 +284,36 @@ def leave_out_for_scores(prepared: Prepared, plan: Plan) -> LeftOut | None:
     return None
 
 
-@record_part()
-def build_left_out(build: Build, left_out: LeftOut, plan: Plan, count: int | None) -> Candidate:
-    """Build a candidate from the remaining views, by a ``plan`` for these views, and score it on the left-out photos.
+def score_left_out(left_out: LeftOut, plan: Plan, count: int) -> float:
+    """Build from the remaining views, by a ``plan`` for these views, and return the PSNR (dB) of the left-out photos.
 
-    ``count`` is the number of Gaussians for all views. The candidate has a part of ``count``, in proportion to its
-    number of views.
+    ``count`` is the number of Gaussians for all views. The remaining views get a part of it, in proportion to their
+    number.
     """
-    assert count is not None
-    begin_part()
-    fitted = build(left_out.rest, plan, left_out.reduce(count))
-    with stage("score"):
-        psnr = mean_seen(left_out.score(fitted.gaussians), left_out.shares)
-    return Candidate(count, fitted, fitted.gaussians, fitted.cameras, psnr, current_record(), psnr)
+    begin_part("build")
+    with record_part() as record:
+        fitted = build(left_out.rest, plan, left_out.reduce(count))
+        with stage("score"):
+            psnr = mean_seen(left_out.score(fitted.gaussians), left_out.shares)
+    add_seconds(record.seconds)
+    return psnr
 
 
-def choose_count(prepared: Prepared, plan: Plan, build: Build, left_out: LeftOut | None, most: int) -> int | None:
+def choose_count(prepared: Prepared, plan: Plan) -> int | None:
     """Choose the number of Gaussians by the budget or the scene's curve; None if ``superpixels`` and K decide.
 
-    The curve is measured on the photos of ``left_out`` or, without them, on patches of all photos. ``most`` is the
-    largest count of the curve.
+    The curve is measured on left-out photos or, without them, on patches of all photos.
     """
-    limits, drop = plan.limits, plan.max_drop
+    limits, drop, left_out = plan.limits, plan.max_drop, leave_out_for_scores(prepared, plan)
     if drop is None and not plan.auto_count:
         return limits.count
     if prepared.reference.name == RENDERS:
         return knee_count(prepared.scene, plan.superpixels)
     with stage("curve"):
-        counts, steps = curve_counts(drop, limits.default, limits.min_count, most)
-        points = measure_curve(prepared, plan, build, steps, counts, left_out)
+        counts, steps = curve_counts(drop, limits.default, limits.min_count, most_useful(prepared, plan, left_out))
+        curve_part = RunPart("curve", STAGE_STEPS * len(prepared.scene), steps)
+        expect_parts([*[curve_part] * len(counts), *run_parts(prepared, plan)])
+        points = measure_curve(prepared, plan, steps, counts, left_out)
     record_choices(
         curve=[asdict(point) for point in points], curve_left_out=0 if left_out is None else len(left_out.photos)
     )

@@ -23,60 +23,54 @@ STAGES = (
     "cover", "decode", "join", "fit", "prune", "fill", "score", "input",
 )  # fmt: skip
 FIT_STEP = "fit: "  # texts that report steps of a fit begin with this text
-BEFORE_FIT = 0.8  # share of the seconds of stages without fits that pass before the fits
+BEFORE_FIT = 0.8  # share of the work of the stages without fits that is done before the fits
 # After these stages memory is released, because their threads have freed much memory that other threads cannot use
 RELEASED = ("prepare", "segment", "encode", "match", "refine", "fit")
 
 
 class RunPart(NamedTuple):
-    """Expected seconds of a part of a run; only the ratios between the seconds of all parts matter."""
+    """A part of a run, with its expected work in steps of a fit; only the ratios between all parts matter."""
 
-    stages: float  # seconds in stages without fits
-    fits: float = 0.0  # seconds in fits
-    num_fits: int = 1
+    name: str
+    stages: float  # Work of the stages without the fit
+    steps: float = 0.0  # Steps of the fit
 
     @property
-    def seconds(self) -> float:
-        """Expected seconds of the whole part."""
-        return self.stages + self.fits
+    def work(self) -> float:
+        """Expected work of the whole part."""
+        return self.stages + self.steps
 
 
 @dataclass
 class Forecast:
-    """Estimates the share of a run that is done, by the expected seconds of its parts and the steps of its fits."""
+    """Estimates the share of a run that is done, by the expected work of its parts and the steps of its fits."""
 
-    parts: list[RunPart] = field(default_factory=list)  # The present part, if one has begun, and the parts after it
-    spent: float = 0.0  # Expected seconds of the parts that have ended
-    has_begun: bool = False  # True from the first call of `begin` on
-    fit: int = 0  # Number of the present fit within the present part, from 0
-    step: int = 0  # Last step of this fit
-    part_spent: float = 0.0  # Expected seconds of the finished share of the present part
+    parts: list[RunPart] = field(default_factory=list)  # The parts that are expected after the present one
+    part: RunPart | None = None  # The present part
+    done: float = 0.0  # Expected work of the parts that have ended
+    done_of_part: float = 0.0  # Expected work of the finished share of the present part
 
-    def begin(self) -> None:
-        """End the present part of the run, if there is one, and begin the next part."""
-        if self.has_begun:
-            self.spent += self.parts.pop(0).seconds
-        if not self.parts:  # more parts than were expected
-            self.parts.append(RunPart(0.0))
-        self.has_begun, self.fit, self.step, self.part_spent = True, 0, 0, 0.0
-
-    def expect(self, parts: Iterable[RunPart]) -> None:
-        """Replace the parts that are expected after the present part."""
-        self.parts[self.has_begun :] = parts
+    def begin(self, name: str) -> None:
+        """End the present part, and begin the next part of this name, without the parts before it."""
+        if self.part is not None:
+            self.done += self.part.work
+        names = [part.name for part in self.parts]
+        self.part, self.done_of_part = RunPart(name, 0.0), 0.0  # of more parts than were expected
+        if name in names:
+            self.part = self.parts[names.index(name)]
+            del self.parts[: names.index(name) + 1]
 
     def take_step(self, step: int, num_steps: int) -> None:
         """Update the estimate of the finished share when a fit has reached step ``step`` of ``num_steps``."""
-        self.fit += step < self.step  # a lower step than before belongs to the next fit
-        self.step = step
-        if self.has_begun:
-            share_of_fits = min(1.0, (self.fit + step / max(num_steps, 1)) / self.parts[0].num_fits)
-            self.part_spent = BEFORE_FIT * self.parts[0].stages + share_of_fits * self.parts[0].fits
+        if self.part is not None:
+            done = BEFORE_FIT * self.part.stages + step / max(num_steps, 1) * self.part.steps
+            self.done_of_part = max(self.done_of_part, done)  # a part may have more fits than were expected
 
     @property
     def share(self) -> float | None:
         """Share of the run that is done; None if no part is expected."""
-        total = self.spent + sum(part.seconds for part in self.parts)
-        return (self.spent + self.part_spent) / total if total else None
+        total = self.done + sum(part.work for part in self.parts) + (0.0 if self.part is None else self.part.work)
+        return (self.done + self.done_of_part) / total if total else None
 
 
 @dataclass
@@ -197,12 +191,12 @@ def adopt(part: Record) -> None:
 
 def expect_parts(parts: Iterable[RunPart]) -> None:
     """Replace the parts that the current run expects after its present part."""
-    current_record().forecast.expect(parts)
+    current_record().forecast.parts = [*parts]
 
 
-def begin_part() -> None:
-    """Begin the next part in the forecast of the current run."""
-    current_record().forecast.begin()
+def begin_part(name: str) -> None:
+    """Begin the next part of this name in the forecast of the current run."""
+    current_record().forecast.begin(name)
 
 
 def report_progress(text: str, done: int, total: int) -> None:

@@ -15,7 +15,7 @@ from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.stages import MIXED, MIXED_COUNTS, DecodeOptions
 from gsmerge.stages.merge import MergedViews
 from gsmerge.stages.superpixels import scene_saliency
-from gsmerge.types import Decoded, FeatureGaussians, Gaussians, PicturedScene, Scene
+from gsmerge.types import Decoded, FeatureGaussians, Gaussians, PicturedScene
 from gsmerge.values.arrays import as_array
 
 GROUPS_PER_TASK = 8192  # number of groups that a thread divides at a time
@@ -47,13 +47,6 @@ def decode(
     )
     gaussians = networks.decode(children, parents, features)
     return gaussians[gaussians.opacities >= options.min_opacity]
-
-
-def keep_all(scene: Scene, count: int | None) -> Decoded | None:
-    """Return all Gaussians of a scene unchanged if ``count`` is at least their number, otherwise None."""
-    if count is None or count < len(scene.gaussians):
-        return None
-    return Decoded(scene.gaussians, len(scene.gaussians), exact=True, is_input=True)
 
 
 @stage("decode")

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from gsmerge.cameras import check_cameras
-from gsmerge.compaction.compact import compact_in_one_piece
+from gsmerge.compaction.compact import compact_prepared
 from gsmerge.compaction.methods import choose_method
 from gsmerge.compaction.placement import pad_harmonics
 from gsmerge.errors import SceneError
@@ -18,6 +18,7 @@ from gsmerge.facts.prepare import Prepared
 from gsmerge.geometry.transforms import camera_centres, camera_distances
 from gsmerge.io.photo_files import photo_array
 from gsmerge.photos.views import camera_kinds, concat_cameras, in_float64, resize_cameras, subset
+from gsmerge.plan import make_plan
 from gsmerge.raster.photos import shrink_pictures
 from gsmerge.runtime.record import Progress, record_run
 from gsmerge.runtime.threads import use_threads
@@ -88,7 +89,7 @@ def extend(
             world = compare_worlds(before.gaussians, batch_views, prepared.input_scene.gaussians.means)
             refuse_other_world(world, extend_options)
             parts = [before.gaussians]
-        result = compact_in_one_piece(prepared, method, options)
+        result = compact_prepared(prepared, make_plan(prepared, options, run=method.run))
     # Only a final result gets the note that the result is worse than its input
     notes = [text for text in result.report.notes if text != result.report.worse]
     notes += [NOT_COMPARED] if before is not None and world == UNKNOWN_WORLD else []

@@ -25,7 +25,7 @@ from gsmerge.networks.cross_view_stats import cross_view_stats
 from gsmerge.networks.tokens import GroupFeatures, describe_features, make_group_features
 from gsmerge.networks.weights import NetworkWeights
 from gsmerge.photos.views import concat_cameras, resize_cameras
-from gsmerge.pipeline import encode_views
+from gsmerge.pipeline import encode_groups
 from gsmerge.plan import make_plan
 from gsmerge.runtime.record import Progress, record_run, stage
 from gsmerge.runtime.threads import use_threads
@@ -35,6 +35,7 @@ from gsmerge.settings.stages import MIXED, DecodeOptions, MatchOptions
 from gsmerge.stages.decode import counts_by_saliency, group_saliency, repeat_groups
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import merge
+from gsmerge.stages.segment import segment_scene
 from gsmerge.stages.superpixels import scene_saliency
 from gsmerge.states.extend import (
     NOT_COMPARED,
@@ -146,7 +147,8 @@ def extend_features(
             raise UsageError(
                 f"recipe paper: expected networks with an encoder and absolute outputs, {options.checkpoint} lacks them"
             )
-        features, members, _, context = encode_views(prepared, plan, None)
+        groups = segment_scene(prepared_scene, plan.superpixels, None).groups
+        features, members, context = encode_groups(prepared_scene, groups, plan)
         assert isinstance(context, NetworkContext)
         samples = sample_fronts(members, prepared_scene.cameras, state)
         pixel_saliency = scene_saliency(prepared_scene.images)

@@ -19,8 +19,9 @@ from gsmerge import plan, types
 from gsmerge.cameras import rows_first, score
 from gsmerge.cameras import score as cameras_off
 from gsmerge.cameras.registration import register
-from gsmerge.compaction import blocks, curve, distance, left_out, new_views, partition, scores, seams, search
+from gsmerge.compaction import blocks, curve, distance, new_views, partition, scores, seams, search
 from gsmerge.facts import confirm_depths, draw_outside, holes, move_poses, scene_size
+from gsmerge.facts.prepare import LEAST_VIEWS
 from gsmerge.fit import outside, photo_sizes, schedule, stage
 from gsmerge.fit import report as fit_report
 from gsmerge.io import bounds, photo_files
@@ -123,7 +124,7 @@ CLAIMS: dict[str, tuple[str, ...]] = {
         f"--effort draft`: {plan.EFFORTS['draft'].steps} steps, no merging across views",
         f"--effort fast`: {plan.EFFORTS['fast'].steps} steps",
         f"--effort best`: {plan.EFFORTS['best'].steps} steps",
-        f"The estimate of the gain needs at least {word(left_out.LEAST_VIEWS)} photos, a result with at most"
+        f"The estimate of the gain needs at least {word(LEAST_VIEWS)} photos, a result with at most"
         f" {percent(new_views.MOST_SHARE)} as many Gaussians as pixels",
         f"the depth of {confirm_depths.CONFIRM_PIXELS:,} pixels of each view is compared with its nearest views, up to"
         f" {confirm_depths.CONFIRM_NEIGHBORS} of them",
@@ -169,7 +170,7 @@ CLAIMS: dict[str, tuple[str, ...]] = {
         f" they confirm {percent(confirm_depths.WRONG_SHARE)} or less",
         f"tries up to {word(search.MAX_LEFT_OUT_BUILDS)} numbers of Gaussians, or {word(search.MAX_BUILDS)}"
         " where no photo is left out",
-        f"With {word(left_out.LEAST_VIEWS)} photos or more, both kinds of `--quality` leave out some views",
+        f"With {word(LEAST_VIEWS)} photos or more, both kinds of `--quality` leave out some views",
     ),
     PHOTOS: (
         f"differs by {colors.EXPOSURE_STEP:g} of the range, averaged over"

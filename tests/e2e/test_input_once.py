@@ -13,7 +13,7 @@ import pytest
 from messages import names
 
 import gsmerge.compaction.files as stage
-from gsmerge.compaction.files import compact_files
+from gsmerge.compaction.compact import compact_files
 from gsmerge.compaction.outputs import Outputs
 from gsmerge.errors import SceneError
 from gsmerge.io.scene_files import find_scene_files

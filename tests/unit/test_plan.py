@@ -14,7 +14,7 @@ from messages import noted
 from scenes import psnr_of
 
 from gsmerge import CompactOptions, Scene, compact
-from gsmerge.compaction.candidate import make_candidate
+from gsmerge.compaction.candidate import score
 from gsmerge.compaction.estimate import estimate
 from gsmerge.compaction.search import MAX_BUILDS, add_target
 from gsmerge.errors import UsageError
@@ -30,11 +30,10 @@ from gsmerge.plan import (
     FIDELITY_LOSS,
     FIDELITY_PSNR,
     Plan,
-    choose_for_scene,
     choose_networks,
     make_plan,
+    plan_scene,
     resolve_budget,
-    resolve_fit,
     steps_for,
 )
 from gsmerge.runtime.record import record_run
@@ -96,9 +95,10 @@ def test_steps_grow_with_the_views() -> None:
 
 
 def test_a_draft_without_a_fit_leaves_out_nothing() -> None:
-    assert resolve_fit(options_of(effort="draft", fit="none")).min_contribution == 0
-    assert resolve_fit(options_of(effort="draft")).min_contribution > 0
-    assert resolve_fit(options_of(fit="none")).min_contribution > 0
+    size = SceneSize(460_800, 12, 240, 160, True, rendered=False)
+    assert plan_scene(size, options_of(effort="draft", fit="none")).fit.min_contribution == 0
+    assert plan_scene(size, options_of(effort="draft")).fit.min_contribution > 0
+    assert plan_scene(size, options_of(fit="none")).fit.min_contribution > 0
 
 
 @pytest.mark.parametrize(
@@ -248,7 +248,7 @@ def test_an_input_with_holes_is_compared_where_it_has_gaussians(scene: Scene) ->
     assert plan.before is not None
     assert plan.target_psnr == plan.before.covered_psnr - FIDELITY_LOSS > plan.before.psnr
     given = prepared.frame.enter(rows.gaussians)  # without those that fill the holes
-    again = make_candidate(None, Fitted(given, prepared.scene.cameras, None), prepared, plan)
+    again = score(Fitted(given, prepared.scene.cameras, None), prepared, plan)
     assert again.psnr == pytest.approx(plan.before.psnr, abs=0.01)
     assert again.deciding_psnr == pytest.approx(plan.before.covered_psnr, abs=0.01)
 
@@ -288,7 +288,7 @@ def test_reports_say_what_was_settled(scene: Scene) -> None:
     assert "tuning" not in plan.settings
     assert "move_cameras" not in plan.settings
     settings = options_of(effort="draft")
-    settled = choose_for_scene(measure_size(scene), settings).settings(settings)
+    settled = plan_scene(measure_size(scene), settings).settings
     assert (settled["match"], settled["checkpoint"]) == ("none", "none")
 
 
@@ -306,8 +306,8 @@ def test_the_estimate_is_what_the_run_does(
 ) -> None:
     plans: list[Plan] = []
 
-    def record_plan(*arguments: Any) -> Plan:
-        plans.append(make_plan(*arguments))
+    def record_plan(*arguments: Any, **run: Any) -> Plan:
+        plans.append(make_plan(*arguments, **run))
         return plans[-1]
 
     monkeypatch.setattr("gsmerge.compaction.compact.make_plan", record_plan)
@@ -316,7 +316,7 @@ def test_the_estimate_is_what_the_run_does(
     run, result, choices = (
         estimate(scene, options),
         compact(scene, options),
-        choose_for_scene(size, resolve_budget(size, options, agreement)),
+        plan_scene(size, resolve_budget(size, options, agreement)),
     )
     assert run["fit_steps"] == choices.fit.steps == result.report.options["fit_steps"]
     assert run["blocks"] == len(result.report.choices.get("blocks", "1"))
@@ -325,7 +325,7 @@ def test_the_estimate_is_what_the_run_does(
     assert count <= run["num_gaussians"]
     assert run["exact"] == (settings in SETTLED)
     for plan in plans:  # none of a scene in blocks
-        assert (plan.limits, plan.decode, plan.match.match) == (choices.limits, choices.decode, choices.match)
+        assert (plan.limits, plan.decode, plan.match.match) == (choices.limits, choices.decode, choices.match.match)
         assert (plan.fit.fit, plan.fit.steps, plan.fit.share) == (choices.fit.fit, choices.fit.steps, choices.fit.share)
         assert run["k"] == plan.decode.k
         assert (plan.checkpoint is None) == (run["checkpoint"] == "none")
@@ -337,7 +337,7 @@ def test_the_estimate_is_what_the_run_does(
 )
 def test_runs_grow_if_they_see_each_photo_twice(effort: str, num_views: int, grows: bool) -> None:
     size = SceneSize(38_400 * num_views, num_views, 240, 160, True, rendered=False)
-    fit = choose_for_scene(size, options_of(effort=effort)).fit
+    fit = plan_scene(size, options_of(effort=effort)).fit
     assert fit.grows == grows
     assert num_views == 12 or fit.steps >= GROW_STEPS
 
@@ -346,10 +346,10 @@ def test_runs_grow_if_they_see_each_photo_twice(effort: str, num_views: int, gro
 def test_limits_beyond_what_wrong_depth_bears_are_as_no_budget(budget: str) -> None:
     size, wrong = SceneSize(1_000_000, 10, 250, 400, True, rendered=False), Agreement(0.3, 0.6, 0.1)
     with record_run() as record:
-        limits = choose_for_scene(size, resolve_budget(size, options_of(budget=budget), wrong)).limits
-        usual = choose_for_scene(size, options_of()).limits
+        limits = plan_scene(size, resolve_budget(size, options_of(budget=budget), wrong)).limits
+        usual = plan_scene(size, options_of()).limits
     assert (limits.exact, limits.count, limits.default) == (usual.exact, usual.count, usual.default)
     assert limits.most == 44_000
     assert noted(record.notes, "44,000", budget)
     asked = resolve_budget(size, options_of(budget="2%"), wrong)
-    assert choose_for_scene(size, asked).limits.count == 20_000
+    assert plan_scene(size, asked).limits.count == 20_000

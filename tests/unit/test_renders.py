@@ -27,7 +27,7 @@ from gsmerge.fit.outside import STEP_BACK_HIGH, STEP_BACK_LOW, outside_cameras
 from gsmerge.fit.report import FitReport
 from gsmerge.geometry.transforms import camera_centres
 from gsmerge.pipeline import build
-from gsmerge.plan import choose_for_scene, make_plan
+from gsmerge.plan import make_plan, plan_scene
 from gsmerge.raster.metrics import psnr
 from gsmerge.types import Decoded, Gaussians, Region
 
@@ -128,11 +128,11 @@ def test_counts_and_cameras_are_as_asked_for(settings: dict[str, object], scene:
 
 def test_the_plan_and_its_estimate_say_so(scene: Scene) -> None:
     size = measure_size(scene)
-    assert choose_for_scene(size, CompactOptions()).may_merge_pairs
+    assert plan_scene(size, CompactOptions()).merges_pairs
     assert estimate(scene, CompactOptions())["superpixels_per_view"] == 0
     for settings in ({"max_color": 0.11}, {"segmentation": "grid"}, {"checkpoint": "shipped"}, {"method": "greedy"}):
-        assert not choose_for_scene(size, CompactOptions().with_settings(settings)).may_merge_pairs
-    assert not choose_for_scene(replace(size, rendered=False), CompactOptions()).may_merge_pairs
+        assert not plan_scene(size, CompactOptions().with_settings(settings)).merges_pairs
+    assert not plan_scene(replace(size, rendered=False), CompactOptions()).merges_pairs
 
 
 def test_cameras_between_stand_half_way_and_look_at_the_same(scene: Scene) -> None:

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from gsmerge.compaction.compact import compact
-from gsmerge.compaction.left_out import LEAST_VIEWS, choose_left_out
+from gsmerge.compaction.left_out import choose_left_out
+from gsmerge.facts.prepare import LEAST_VIEWS
 from gsmerge.io.formats.ply import file_bytes
 from gsmerge.io.jsonl import each_line
 from gsmerge.io.scene_files import find_scene_files

@@ -41,8 +41,8 @@ def test_the_bar_of_a_run_fills_beside_the_name_of_the_stage(
     with redirect_stderr(Terminal()) as terminal, stage_progress(quiet=False) as progress:
         progress("read: small.ply", 3, 3)
     with redirect_stderr(terminal), stage_progress(quiet=False) as progress, record_run(progress):
-        expect_parts([RunPart(1.0, 3.0)])
-        begin_part()
+        expect_parts([RunPart("build", 1.0, 3.0)])
+        begin_part("build")
         report_progress("fit: photos 20.0 dB", 100, 100)
     lines = [line for line in terminal.lines() if "━" in line]
     assert all(len(line) < int(columns) for line in lines)

@@ -7,8 +7,7 @@ from typing import Any
 import pytest
 
 from gsmerge.compaction import report
-from gsmerge.compaction.new_views import NewViews
-from gsmerge.compaction.report import CompactReport, Covered
+from gsmerge.compaction.report import CompactReport, Covered, NewViews
 from gsmerge.measure.documents import to_json
 from gsmerge.settings.compact import CompactOptions
 

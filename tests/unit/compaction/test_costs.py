@@ -8,27 +8,30 @@ import numpy as np
 from made_gaussians import random_gaussians
 
 from gsmerge import CompactOptions
-from gsmerge.compaction.costs import IMPORT_SECONDS, CountChoice, RunCosts
+from gsmerge.compaction.costs import IMPORT_SECONDS, RunCosts, usual_builds
+from gsmerge.compaction.curve import curve_counts
 from gsmerge.compaction.estimate import estimate
-from gsmerge.facts.counts import count_limits
+from gsmerge.facts.counts import count_limits, level_counts
 from gsmerge.facts.scene_size import SceneSize
 from gsmerge.types import Cameras, Scene
 
 VIEW = 480 * 320
 ALONE = Scene(random_gaussians(20_000, 0), Cameras(np.zeros((0, 4, 4)), np.zeros((0, 3, 3)), 1, 1), None, None, ())
-ONCE = CountChoice()
 
 
 def seconds(
-    views: int = 12, *, steps: int = 240, count: int = 50_000, threads: int = 1, choice: CountChoice = ONCE,
-    has_trial: bool = False, **changes: Any,
+    views: int = 12, *, steps: int = 240, count: int = 50_000, threads: int = 1, num_builds: int = 1,
+    has_curve: bool = False, has_trial: bool = False, **changes: Any,
 ) -> float:  # fmt: skip
     """Return the wall time of a run, with settings of ``compact``."""
     options = CompactOptions().with_settings({"checkpoint": "none"} | changes)
     size = SceneSize(views * VIEW, views, 320, 480, True, rendered=False)
-    costs = RunCosts(options.to_dict(), views * VIEW, VIEW, 0.5, steps, choice=choice, has_trial=has_trial)
     limits = count_limits(size, options.segment, options.decode, options.budget)
-    return costs.seconds(costs.all_parts(limits, count), views, threads)
+    curve = curve_counts(None, limits.default, limits.min_count, limits.max_count) if has_curve else ((), 0)
+    costs = RunCosts(
+        options.to_dict(), views * VIEW, VIEW, 0.5, steps, num_builds=num_builds, curve=curve, has_trial=has_trial
+    )
+    return costs.seconds(count, level_counts(count, options.budget.levels), views, threads)
 
 
 def test_a_run_with_more_work_is_estimated_to_take_longer() -> None:
@@ -37,9 +40,8 @@ def test_a_run_with_more_work_is_estimated_to_take_longer() -> None:
     assert seconds(steps=0, method="random") < usual < seconds(recipe="paper", checkpoint="paper")
     assert usual < min(seconds(24), seconds(steps=1000), seconds(count=10**6))
     assert seconds(steps=0, count=1) == seconds(steps=0, count=10**6)
-    for choice in (CountChoice(has_curve=True), CountChoice(has_target=True)):
-        assert usual < seconds(choice=choice) < 4 * usual
-    for longer in (seconds(levels=3), seconds(has_trial=True)):
+    searched = seconds(num_builds=usual_builds(has_target=True, rendered=False))
+    for longer in (seconds(levels=3), seconds(has_trial=True), seconds(has_curve=True), searched):
         assert usual < longer < 4 * usual
     assert seconds(2) > seconds(2, threads=2) == seconds(2, threads=16)
 

@@ -11,7 +11,7 @@ from messages import noted
 from tiny_scene import Tiny, make_tiny
 
 import gsmerge
-from gsmerge.compaction.files import compact_files
+from gsmerge.compaction.compact import compact_files
 from gsmerge.compaction.outputs import Outputs
 from gsmerge.inspection.file_checks import check_content
 from gsmerge.io import read_gaussians, write_ply

@@ -9,9 +9,10 @@ import pytest
 import scenes
 
 from gsmerge import Gaussians, Scene, compact, render
-from gsmerge.compaction.left_out import LEAST_VIEWS, choose_left_out, leave_out, mark_seen, mean_seen
-from gsmerge.compaction.new_views import OWN_WEIGHT, SPREAD, NewViews, Trial, shrink_scene
-from gsmerge.facts.prepare import prepare
+from gsmerge.compaction.left_out import choose_left_out, leave_out, mark_seen, mean_seen
+from gsmerge.compaction.new_views import OWN_WEIGHT, SPREAD, Trial, shrink_scene
+from gsmerge.compaction.report import NewViews
+from gsmerge.facts.prepare import LEAST_VIEWS, prepare
 from gsmerge.io.formats.arrays import ExpectedScores, copied_comments, new_views_comment, read_expected_scores
 from gsmerge.pages.page import describe_gain
 from gsmerge.photos.views import subset

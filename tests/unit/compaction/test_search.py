@@ -6,22 +6,25 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import cast
 
 import pytest
 from messages import noted, refuses
 
+from gsmerge.compaction.candidate import Candidate
 from gsmerge.compaction.curve import CurvePoint, count_within, curve_counts, curve_knee
 from gsmerge.compaction.left_out import LeftOut
 from gsmerge.compaction.search import MAX_BUILDS, MAX_LEFT_OUT_BUILDS, SAME_COUNT_RATIO, CountSearch, search_count
 from gsmerge.facts.counts import exact_count, level_counts, max_allowed
 from gsmerge.facts.prepare import Prepared
-from gsmerge.fit import FitOptions
+from gsmerge.fit import FitOptions, Fitted
 from gsmerge.kernels import elementary
 from gsmerge.photos.row_colors import PHOTOS
-from gsmerge.pipeline import Build
 from gsmerge.plan import FIDELITY_LOSS, Plan
+from gsmerge.runtime.record import Record
 from gsmerge.settings.budget import DEVICES, BudgetOptions, parse_share, share_text
+from gsmerge.settings.stages import CleanOptions
+from gsmerge.types import Cameras, Gaussians
 
 
 def log2(number: float) -> float:
@@ -46,6 +49,7 @@ def make_plan(
         min_count=least, max_count=most, default=most if default is None else default, num_input=most
     )
     kept = {"keeps_fidelity": keeps_fidelity, "auto_count": False, "max_drop": None, "fit": FitOptions(fit="none")}
+    kept |= {"clean": CleanOptions(), "file_size": None}
     return cast("Plan", SimpleNamespace(target_psnr=target_psnr, limits=limits, levels=levels, **kept))
 
 
@@ -160,13 +164,8 @@ def rises(count: int) -> float:
 def search(curve: Callable[[int], float], target: float, start: int, least: int, most: int) -> CountSearch:
     """Run a search on a curve that is known, instead of building scenes."""
     counts = CountSearch(make_plan(target_psnr=target, least=least, most=most), start)
-    counts.run(lambda count: fake_result(count, curve(count)))
+    counts.run(curve)
     return counts
-
-
-def fake_result(count: int | None, psnr: float) -> Any:
-    record = SimpleNamespace(seconds={})
-    return SimpleNamespace(count=count, psnr=psnr, deciding_psnr=psnr, gaussians=range(count or 0), record=record)
 
 
 @pytest.mark.parametrize("start", [10, 300, 1000, 4000, 90_000])
@@ -174,29 +173,28 @@ def fake_result(count: int | None, psnr: float) -> Any:
 def test_search_finds_the_fewest_gaussians_that_meet_the_target(start: int, target: float) -> None:
     actual = search(rises, target, start, 10, 100_000)
     fewest = 1000 * 2 ** ((target - 20) / 2)
-    best = actual.best
-    assert actual.facts(actual.best).unmet is None
-    assert best.psnr == rises(best.count) >= target
-    assert best.count <= max(2.5 * fewest, 10)
+    assert actual.describe_unmet(actual.best) is None
+    assert actual.psnr == rises(actual.best) >= target
+    assert actual.best <= max(2.5 * fewest, 10)
     assert len(actual.psnrs) <= MAX_BUILDS
 
 
 def test_search_that_starts_near_the_answer_ends_close_to_the_answer() -> None:
-    count = search(rises, 24.0, 3000, 10, 100_000).best.count
+    count = search(rises, 24.0, 3000, 10, 100_000).best
     assert 4000 <= count <= 4000 * 1.3
 
 
 def test_search_says_that_the_target_is_out_of_reach() -> None:
     actual = search(rises, 40.0, 1000, 10, 5000)
     reached = f"the input views reach {rises(5000):.2f} dB with 5,000 Gaussians"
-    assert actual.facts(actual.best).unmet == f"quality: 40 dB was asked for; {reached}, the best that was tried"
-    assert (actual.best.count, actual.best.psnr) == (5000, rises(5000))
+    assert actual.describe_unmet(actual.best) == f"quality: 40 dB was asked for; {reached}, the best that was tried"
+    assert (actual.best, actual.psnr) == (5000, rises(5000))
 
 
 def test_search_keeps_the_best_of_a_curve_that_falls() -> None:
     actual = search(lambda count: 20 - abs(log2(count / 1000)), 25.0, 1000, 10, 5000)
-    assert actual.facts(actual.best).unmet is not None
-    assert actual.best.count == 1000
+    assert actual.describe_unmet(actual.best) is not None
+    assert actual.best == 1000
 
 
 def test_search_stays_within_its_limits() -> None:
@@ -205,11 +203,19 @@ def test_search_stays_within_its_limits() -> None:
 
 
 @pytest.mark.parametrize(("default", "first"), [(500, 700), (800, 800), (100_000, 900)])
-def test_search_begins_within_its_limits(default: int, first: int) -> None:
+def test_search_begins_within_its_limits(default: int, first: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    built = list[int]()
+
+    def build(_: Prepared, __: Plan, count: int) -> Candidate:
+        built.append(count)
+        gaussians = cast("Gaussians", range(count))
+        return Candidate(count, cast("Fitted", None), gaussians, cast("Cameras", None), 30.0, Record(), 30.0)
+
+    monkeypatch.setattr("gsmerge.compaction.search.build_candidate", build)
     plan = make_plan(target_psnr=25.0, least=700, most=900, default=default)
     reference = SimpleNamespace(name=PHOTOS, score_views=range(3))
-    prepared = cast("Prepared", SimpleNamespace(reference=reference, agreement=None))
-    assert search_count(prepared, plan, cast("Build", None)).first == first
+    search_count(cast("Prepared", SimpleNamespace(reference=reference, agreement=None, can_leave_out=False)), plan)
+    assert built[0] == first
 
 
 def search_as_good_as_input(
@@ -218,31 +224,31 @@ def search_as_good_as_input(
     """Run the search that keeps the input by default: 32.5 dB of its renders, or of photos."""
     plan = make_plan(target_psnr=32.5, most=most, default=default, keeps_fidelity=True)
     counts = CountSearch(plan, default, rendered)
-    counts.run(lambda count: fake_result(count, curve(count)))
+    counts.run(curve)
     return counts
 
 
 def test_the_usual_count_is_kept_where_it_is_good_enough() -> None:
     actual = search_as_good_as_input(lambda _: 40.0, 1000, 20_000)
     assert list(actual.psnrs) == [1000]  # not fewer, and no further run
-    assert actual.notes == []
+    assert actual.notes(actual.best) == []
 
 
 @pytest.mark.parametrize("slope", [2.0, 3.0, 5.0])
 @pytest.mark.parametrize("needed", [1.1, 2.0, 7.0])
 def test_the_count_rises_until_renders_of_the_input_are_kept(slope: float, needed: float) -> None:
     actual = search_as_good_as_input(lambda count: 32.5 + slope * log2(count / (1000 * needed)), 1000, 20_000)
-    assert actual.best.psnr >= 32.5
-    assert actual.best.count <= 1.4 * 1000 * needed
+    assert actual.psnr >= 32.5
+    assert actual.best <= 1.4 * 1000 * needed
     assert len(actual.psnrs) <= 5
-    assert noted(actual.notes, f"{actual.best.count:,} of 20,000")
+    assert noted(actual.notes(actual.best), f"{actual.best:,} of 20,000")
 
 
 def test_all_gaussians_of_a_compact_scene_are_kept() -> None:
     actual = search_as_good_as_input(lambda count: 120.0 if count == 5000 else 25.0, 220, 5000)
-    assert actual.best.count == 5000
-    assert noted(actual.notes, "compact already", "5,000 of 5,000")
-    assert actual.facts(actual.best).unmet is None
+    assert actual.best == 5000
+    assert noted(actual.notes(actual.best), "compact already", "5,000 of 5,000")
+    assert actual.describe_unmet(actual.best) is None
 
 
 @pytest.mark.parametrize("slope", [0.5, 1.0, 2.0])
@@ -253,9 +259,9 @@ def test_the_count_rises_until_photos_are_shown_as_by_the_input(slope: float, ne
         lambda count: 32.5 + slope * log2(count / (1000 * needed)), 1000, 40_000, rendered=False
     )
     assert actual.is_met
-    assert actual.best.count <= 1000 * needed * 2 ** (FIDELITY_LOSS / slope) * SAME_COUNT_RATIO
+    assert actual.best <= 1000 * needed * 2 ** (FIDELITY_LOSS / slope) * SAME_COUNT_RATIO
     assert len(actual.psnrs) <= 5
-    assert noted(actual.notes, f"{actual.best.count:,} of 40,000", "at most 0.3 dB worse than the input")
+    assert noted(actual.notes(actual.best), f"{actual.best:,} of 40,000", "at most 0.3 dB worse than the input")
 
 
 @pytest.mark.parametrize("curve", [lambda _: 12.0, lambda count: 13 - log2(count / 1000)])
@@ -263,28 +269,21 @@ def test_search_ends_early_where_no_count_shows_the_photos(curve: Callable[[int]
     """As of another scene. The best is kept, even if it is the usual count."""
     actual = search_as_good_as_input(curve, 1000, 20_000, rendered=False)
     assert len(actual.psnrs) <= MAX_BUILDS
-    assert (actual.best.count, actual.is_met, actual.facts(actual.best).unmet) == (1000, False, None)
-    assert actual.notes == []
+    assert (actual.best, actual.is_met, actual.describe_unmet(actual.best)) == (1000, False, None)
+    assert actual.notes(actual.best) == []
 
 
 def test_the_note_says_that_the_largest_count_is_too_few() -> None:
     actual = search_as_good_as_input(lambda count: 20 + log2(count / 1000), 1000, 3000, rendered=False)
-    assert actual.best.count == 3000
-    assert noted(actual.notes, "each of the 2 counts", "over 0.3 dB worse")
-
-
-@pytest.mark.parametrize("first", [300, None])
-def test_one_count_is_built_where_no_quality_is_asked_for(first: int | None) -> None:
-    counts = CountSearch(make_plan(), first)
-    counts.run(lambda count: fake_result(count, 20.0))
-    assert [candidate.count for candidate in counts.candidates] == [first]
+    assert actual.best == 3000
+    assert noted(actual.notes(actual.best), "each of the 2 counts", "over 0.3 dB worse")
 
 
 def judge_left_out(curve: Callable[[int], float], target: float, most: int | None = None) -> CountSearch:
     """Run a search that photos judge which the builds leave out."""
     photos = cast("LeftOut", SimpleNamespace(photos=range(2)))
     counts = CountSearch(make_plan(target_psnr=target, least=10, most=100_000), 1000, left_out=photos, most=most)
-    counts.run(lambda count: fake_result(count, curve(count)))
+    counts.run(curve)
     return counts
 
 
@@ -301,6 +300,7 @@ def test_few_builds_meet_a_target_on_photos_left_out(target: float) -> None:
 def test_search_on_photos_left_out_stops_at_the_count_they_gain_from() -> None:
     actual = judge_left_out(lambda count: 20 + log2(count / 1000), 30.0, most=1600)
     assert max(actual.psnrs) == actual.count == 1600
-    facts, reached = actual.facts(actual.best), "photos left out reach 20.68 dB with 1,600 Gaussians"
-    assert facts.unmet == f"quality: 30 dB was asked for; {reached}, the best that was tried"
-    assert facts.choices["search"]["left_out"] == 2
+    reached = "photos left out reach 20.68 dB with 1,600 Gaussians"
+    unmet = f"quality: 30 dB was asked for; {reached}, the best that was tried"
+    assert actual.describe_unmet(actual.best) == unmet
+    assert actual.choices["left_out"] == 2

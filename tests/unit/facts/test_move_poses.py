@@ -10,7 +10,7 @@ import pytest
 import scenes
 
 from gsmerge import CompactOptions, Scene, compact
-from gsmerge.compaction.compact import build_cleaned
+from gsmerge.compaction.clean_up import build_cleaned
 from gsmerge.facts.move_poses import CHANCE, move_poses
 from gsmerge.facts.prepare import prepare
 from gsmerge.fit import Fitted
@@ -145,14 +145,12 @@ def test_coarser_levels_have_the_cameras_of_the_finest(small: Scene) -> None:
     np.testing.assert_array_equal(result.coarser[0].cameras.viewmats, result.cameras.viewmats)
 
 
-def test_clean_up_keeps_the_poses_of_the_fit(small: Scene) -> None:
+def test_clean_up_keeps_the_poses_of_the_fit(small: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     moved = replace(small.cameras, viewmats=small.cameras.viewmats + 0.01)
-
-    def method(*_: object) -> Fitted:
-        return Fitted(small.gaussians, moved, None)
-
+    fitted = Fitted(small.gaussians, moved, None)
+    monkeypatch.setattr("gsmerge.compaction.clean_up.build", lambda *_: fitted)
     options, prepared = CompactOptions().with_settings({"drop": "floaters"}), prepare(small)
-    assert build_cleaned(method, prepared, make_plan(prepared, options), None).cameras is moved
+    assert build_cleaned(prepared, make_plan(prepared, options), None).cameras is moved
 
 
 @pytest.mark.parametrize("size", [(12, 8), (40, 1)])

@@ -108,22 +108,38 @@ def test_threads_of_the_caller_have_runs_of_their_own() -> None:
 
 
 def test_forecast_tells_the_share_done_from_parts_and_steps_of_fits() -> None:
-    """Also with two fits in a part, and after fewer or more parts than were expected."""
     forecast, shares = Forecast(), []
     assert forecast.share is None
-    forecast.expect([RunPart(20, 80, num_fits=2), RunPart(10, 90), RunPart(100), RunPart(100)])
-    for _ in range(2):
-        forecast.begin()
-        for step in (1, 50, 100, 1, 100)[: 5 if not shares else 3]:
+    forecast.parts = [
+        RunPart("build", 20, 80),
+        RunPart("build", 10, 90),
+        RunPart("build", 0, 100),
+        RunPart("input", 50),
+    ]
+    for steps in ((1, 50, 100), (1, 100)):
+        forecast.begin("build")
+        for step in steps:
             forecast.take_step(step, 100)
             shares.append(forecast.share)
-    before = 20 * BEFORE_FIT
-    done = [before + 0.4, before + 20, before + 40, before + 40.4, before + 80]
-    done += [100 + 10 * BEFORE_FIT + share * 90 for share in (0.01, 0.5, 1.0)]
-    assert shares == pytest.approx([seconds / 400 for seconds in done])
-    forecast.expect([RunPart(50)])  # the search has ended before it was expected to
-    forecast.begin()
-    assert forecast.share == pytest.approx(200 / 250)
-    forecast.begin()
-    forecast.begin()
-    assert forecast.share == 1
+    done = [20 * BEFORE_FIT + share * 80 for share in (0.01, 0.5, 1.0)]
+    done += [100 + 10 * BEFORE_FIT + share * 90 for share in (0.01, 1.0)]
+    assert shares == pytest.approx([work / 350 for work in done])
+
+
+def test_forecast_leaves_out_parts_that_a_run_did_not_need() -> None:
+    forecast = Forecast([RunPart("build", 50), RunPart("build", 50), RunPart("input", 100)])
+    forecast.begin("build")
+    forecast.begin("input")  # the search has ended before it was expected to
+    assert forecast.share == pytest.approx(50 / 150)
+
+
+def test_forecast_does_not_fall_in_parts_and_fits_that_were_not_expected() -> None:
+    forecast = Forecast([RunPart("build", 20, 80)])
+    forecast.begin("build")
+    forecast.take_step(100, 100)
+    share = forecast.share
+    forecast.take_step(1, 100)  # of a second fit
+    assert forecast.share == share
+    for _ in range(2):
+        forecast.begin("build")
+        assert forecast.share == 1

@@ -13,7 +13,8 @@ from tiny_scene import Tiny, make_tiny, write_inria
 
 from gsmerge.batch.find import find_scenes
 from gsmerge.cli import main
-from gsmerge.compaction.files import compact_files, read_input
+from gsmerge.compaction.compact import compact_files
+from gsmerge.compaction.files import read_input
 from gsmerge.compaction.outputs import Outputs
 from gsmerge.errors import SceneError
 from gsmerge.inspection.file_checks import check_content

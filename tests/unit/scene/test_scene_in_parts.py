@@ -13,7 +13,7 @@ from tiny_scene import Tiny
 
 import gsmerge
 from gsmerge.cli import main
-from gsmerge.compaction.files import compact_files
+from gsmerge.compaction.compact import compact_files
 from gsmerge.compaction.outputs import Outputs
 from gsmerge.errors import SceneError
 from gsmerge.io import write_ply
