@@ -8,8 +8,9 @@ the photos.
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -20,7 +21,7 @@ import numpy as np
 from gsmerge.cameras.dropped_rows import follow_rows
 from gsmerge.cameras.estimate import estimate_cameras
 from gsmerge.cameras.frames import exporter_frames, fit_frame, scale_by, solve_poses
-from gsmerge.cameras.grids import Grid, PlacedGrid, file_grids, photo_grid, with_photo_size, with_poses
+from gsmerge.cameras.grids import Grid, list_grids, with_poses, with_sizes
 from gsmerge.cameras.layouts import ESTIMATED, NO_CAMERAS_USED, Layout
 from gsmerge.cameras.poses import move_cameras, other_conventions
 from gsmerge.cameras.score import (
@@ -38,7 +39,7 @@ from gsmerge.geometry.transforms import IDENTITY, Similarity, median
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.formats.read import GaussianFile
 from gsmerge.io.image_names import natural_key
-from gsmerge.io.photo_files import NO_IMAGES, PhotoArrays, PhotoTransform, Size, as_floats, photo_size
+from gsmerge.io.photo_files import NO_IMAGES, PhotoArrays, PhotoTransform, as_floats, photo_size
 from gsmerge.runtime.memory import free_pages
 from gsmerge.types import Cameras
 
@@ -56,11 +57,6 @@ class RowSource:
     photos: PhotoArrays
     order: str  # hint on the order of the rows; "auto": unknown
     scale: float | None  # hint on the length of one unit of the cameras' world in the Gaussians' world
-
-    @property
-    def size(self) -> Size | None:
-        """Width and height of the photos; None without photos."""
-        return photo_size(self.photos)
 
     @cached_property
     def images(self) -> np.ndarray:
@@ -84,14 +80,14 @@ class RowSource:
 class Recovery:
     """Rows that are the pixels of a grid, with the grid's cameras moved into the frame of the Gaussians."""
 
-    place: PlacedGrid  # the grid, and the frame of the Gaussians
+    grid: Grid  # the grid, in the frame of the Gaussians
     layout: Layout  # the pixel of each row
     alignment: Alignment  # how near the rows are to their pixels
 
     @property
     def frame(self) -> Similarity:
         """Similarity from the frame of the cameras to the frame of the Gaussians."""
-        return self.place.frame
+        return self.grid.frame
 
     @property
     def description(self) -> str:
@@ -148,22 +144,16 @@ def align(
         SceneError: If photos and cameras do not agree in size, if no cameras see the Gaussians, or if the rows are the
             pixels of other cameras.
     """
-    camera_file = with_photo_size(camera_file, photo_size(photos))
-    source = RowSource(ply, camera_file, photos, order, scale)
-    grids, shape_error = file_grids(camera_file, source.size), None
-    try:
-        grids.insert(0, photo_grid(camera_file, source.size))
-    except SceneError as error:  # photos of another shape, to which cameras may have to be cropped
-        shape_error = error
-    recovery = next(filter(None, (_recover_pixels(source, grid) for grid in grids)), None)
-    if recovery is not None:
-        return _make_alignment(source, recovery)
-    if shape_error is not None and not grids:
-        raise shape_error
+    camera_file = with_sizes(camera_file, photo_size(photos))
+    source, grids = RowSource(ply, camera_file, photos, order, scale), list_grids(camera_file, photo_size(photos))
+    for grid in grids:
+        recovery = _recover_pixels(source, grid)
+        if recovery is not None:
+            return _make_alignment(source, recovery)
     try:
         return _align_without_pixels(source, grids[0], frames)
     except SceneError as error:
-        raise shape_error or error from error
+        raise grids[0].mismatch or error from error
 
 
 def _recover_pixels(source: RowSource, grid: Grid) -> Recovery | None:
@@ -175,7 +165,12 @@ def _recover_pixels(source: RowSource, grid: Grid) -> Recovery | None:
     if source.camera_file.pixel_ids is not None:
         layouts = [replace(layout, ids=source.camera_file.pixel_ids)]
     elif count != layers * num_pixels or source.order == "view-fastest":  # some pixels may have no row
-        return _follow_order(source, grid, _list_frames(source, grid))
+        recovery, own = _follow_order(source, grid, exporter_frames(grid.cameras, source.scale)), None
+        if recovery is None:  # the frame in which the cameras fit cameras that are estimated from the rows
+            own = source.own_cameras
+        if own is not None and len(own) == len(grid.cameras):
+            recovery = _follow_order(source, grid, [fit_frame(grid.cameras, own.viewmats, source.scale)])
+        return recovery
     elif layers == 1:  # views are in the order of the camera file, or of the names
         names = source.camera_file.names
         by_name = np.array(sorted(range(len(names)), key=lambda view: natural_key(names[view])))
@@ -217,7 +212,8 @@ def _place_layout(source: RowSource, grid: Grid, layout: Layout) -> Recovery | N
             and median(pixel_errors(shuffled, cameras)) >= far_px
             and (layout.ids is None or float(is_near.mean()) >= min_share)
         )
-        return Recovery(PlacedGrid(grid, frame, _EVIDENCE), layout, alignment) if rows_lie_in_pixels else None
+        placed = replace(grid, frame=frame, shown_by=_EVIDENCE)
+        return Recovery(placed, layout, alignment) if rows_lie_in_pixels else None
 
     usual = exporter_frames(grid.cameras, source.scale)[0]
     if recovery := accept(grid, usual, _PLAIN_PX):
@@ -228,18 +224,12 @@ def _place_layout(source: RowSource, grid: Grid, layout: Layout) -> Recovery | N
         solved_px = check_pairs(pairs, replace(grid.cameras, viewmats=poses)).worst_px
         rounding_px = 0.1  # a file's cameras may err more than solved poses by this, since files round numbers
         limit = max(AS_NEAR * solved_px, solved_px + rounding_px)
-        for other in _list_conventions(source, grid):
+        conventions = other_conventions(source.camera_file.viewmats, source.camera_file.convention)
+        for other in itertools.chain([grid], (with_poses(grid, poses) for poses in conventions)):
             frame = fit_frame(other.cameras, poses, source.scale)
             if recovery := accept(other, IDENTITY, limit) or accept(other, frame, limit):
                 return recovery
     return accept(_move_to_rows(source, grid, layout), IDENTITY, np.inf)
-
-
-def _list_conventions(source: RowSource, grid: Grid) -> Iterator[Grid]:
-    """Yield the grid with its poses as stored, and then with its poses as read in each other convention."""
-    yield grid
-    for poses in other_conventions(source.camera_file.viewmats, source.camera_file.convention):
-        yield with_poses(grid, poses)
 
 
 def _move_to_rows(source: RowSource, grid: Grid, layout: Layout) -> Grid:
@@ -259,54 +249,38 @@ def _move_to_rows(source: RowSource, grid: Grid, layout: Layout) -> Grid:
         return grid
     confirmed, moves = (grid.cameras.viewmats, ()) if moved.confirmed else (None, moved.moves)
     return replace(
-        grid, cameras=moved.cameras, notes=(*grid.notes, moved.note), moves=moves, confirmed_viewmats=confirmed
+        grid, cameras=moved.cameras, remarks=(*grid.remarks, moved.note), moves=moves, confirmed_viewmats=confirmed
     )
 
 
-def _follow_order(source: RowSource, grid: Grid, frames: Iterable[Similarity]) -> Recovery | None:
+def _follow_order(source: RowSource, grid: Grid, frames: Sequence[Similarity]) -> Recovery | None:
     """Find the pixels of rows in the order of the pixels, if some pixels have no row; None for rows in another order.
 
-    Each of ``frames`` is tried with both orders: by view, line and column, and by line, column and view.
+    Each of ``frames`` is tried with both orders: by view, line and column, and by line, column and view. A few rows may
+    have no pixel.
     """
     rows = np.flatnonzero(source.ply.valid)
     if len(rows) > len(grid.cameras) * math.prod(grid.size) or len(rows) * len(grid.cameras) > _MOST_PLACES:
         return None  # there are more rows than pixels, or too many to follow
     orders = [order for order in ("view-major", "view-fastest") if source.order in ("auto", order)]
     points = np.ascontiguousarray(source.ply.gaussians.means[rows], np.float32)
-    for frame in frames:
-        place = PlacedGrid(grid, frame, _EVIDENCE)
-        for order in orders:
-            ids = _follow_pixels(points, place.cameras, mixed=order == "view-fastest")
-            if ids is not None:
-                pixel_ids = np.full(len(source.ply.gaussians), -1)
-                pixel_ids[rows] = ids
-                layout = Layout(len(grid.cameras), *grid.size, order, pixel_ids)
-                pairs = source.inputs(grid, photos=False).pairs(layout)
-                return Recovery(place, layout, check_pairs(pairs, place.cameras))
+    first_rows, min_placed = 20_000, 0.99  # rows that are followed first, and the share of rows that must have a pixel
+    for frame, order in itertools.product(frames, orders):
+        placed = replace(grid, frame=frame, shown_by=_EVIDENCE)
+        cameras = placed.placed
+        viewmats = np.ascontiguousarray(cameras.viewmats, np.float64)
+        Ks = np.ascontiguousarray(cameras.Ks, np.float64)
+        for part in (points[:first_rows], points):  # the first rows rule out most other orders
+            ids = follow_rows(part, viewmats, Ks, *grid.size, mixed=order == "view-fastest")
+            if (ids >= 0).sum() < min_placed * len(part):
+                break
+        else:
+            pixel_ids = np.full(len(source.ply.gaussians), -1)
+            pixel_ids[rows] = ids
+            layout = Layout(len(grid.cameras), *grid.size, order, pixel_ids)
+            pairs = source.inputs(grid, photos=False).pairs(layout)
+            return Recovery(placed, layout, check_pairs(pairs, cameras))
     return None
-
-
-def _list_frames(source: RowSource, grid: Grid) -> Iterator[Similarity]:
-    """Yield the frames of exporters, and then the frame in which the cameras fit cameras estimated from the rows."""
-    yield from exporter_frames(grid.cameras, source.scale)
-    if source.own_cameras is not None and len(source.own_cameras) == len(grid.cameras):
-        yield fit_frame(grid.cameras, source.own_cameras.viewmats, source.scale)
-
-
-def _follow_pixels(points: np.ndarray, cameras: Cameras, *, mixed: bool) -> np.ndarray | None:
-    """Find the pixels ``[n]`` of rows, at ``points [n,3]``, in the order of the pixels; None for rows in another order.
-
-    A few rows may have no pixel; their result is -1. If ``mixed`` is True, rows are sorted by line, column and view.
-    """
-    matrices = np.ascontiguousarray(cameras.viewmats, np.float64), np.ascontiguousarray(cameras.Ks, np.float64)
-    ids = None
-    first_rows = 20_000  # rows that must follow the order of the pixels before all rows are tried
-    min_placed = 0.99  # share of the rows that must have a pixel
-    for part in (points[:first_rows], points):  # the first rows rule out most other orders
-        ids = follow_rows(part, *matrices, cameras.width, cameras.height, mixed=mixed)
-        if (ids >= 0).sum() < min_placed * len(part):
-            return None
-    return ids
 
 
 # Rows without pixels, and results
@@ -328,17 +302,17 @@ def _align_without_pixels(source: RowSource, grid: Grid, frames: Callable[[], Se
     no_pixels, notes_on_choice = no_pixels_error(source.ply.info, grid.cameras), list[str]()
     rotation = upright_rotation(inputs)
     if rotation is None:
-        place, notes_on_choice = choose_cameras(replace(inputs, cameras=grid.cameras), grid, frames(), no_pixels)
+        grid, notes_on_choice = choose_cameras(replace(inputs, cameras=grid.cameras), grid, frames(), no_pixels)
     else:
         upright = solve_upright(inputs, rotation, source.ply.info.path)
-        place = PlacedGrid(grid, upright, "photos' colours")
-    cameras, camera_file = place.cameras, place.grid.camera_file
-    if place.frame is not IDENTITY:
-        recovery = None if source.order == "none" else _follow_order(source, grid, [place.frame])
+        grid = replace(grid, frame=upright, shown_by="photos' colours")
+    cameras, camera_file = grid.placed, grid.camera_file
+    if grid.frame is not IDENTITY:
+        recovery = None if source.order == "none" else _follow_order(source, grid, [grid.frame])
         if recovery is not None:  # the rows alone did not show their scale, but the photos did
             return _make_alignment(source, recovery)
         camera_file = replace(camera_file, viewmats=cameras.viewmats)
-    notes = (*place.notes(source.camera_file.convention), *notes_on_choice)
+    notes = (*grid.list_notes(source.camera_file.convention), *notes_on_choice)
     return AlignmentResult(
         pixel_ids=None,
         cameras=cameras,
@@ -353,8 +327,8 @@ def _align_without_pixels(source: RowSource, grid: Grid, frames: Callable[[], Se
 
 def _make_alignment(source: RowSource, recovery: Recovery) -> AlignmentResult:
     """Make the result for rows that are pixels, with cameras and poses in the frame of the Gaussians."""
-    place, grid, camera_file = recovery.place, recovery.place.grid, source.camera_file
-    inputs, notes, confirmed = source.inputs(grid), place.notes(camera_file.convention), grid.confirmed_viewmats
+    grid, camera_file = recovery.grid, source.camera_file
+    inputs, notes, confirmed = source.inputs(grid), grid.list_notes(camera_file.convention), grid.confirmed_viewmats
     free_pages(vars(inputs.gaussians).values())  # the search has read all rows
     if camera_file.source == ESTIMATED:
         focals_differ = len(set(map(bytes, camera_file.Ks))) > 1
@@ -364,12 +338,12 @@ def _make_alignment(source: RowSource, recovery: Recovery) -> AlignmentResult:
         notes.append(f"{NO_CAMERAS_USED}: {subject} are estimated from the Gaussians' own grid")
     return AlignmentResult(
         pixel_ids=recovery.layout.pixel_ids(),
-        cameras=place.cameras,
+        cameras=grid.placed,
         images=inputs.images,
         camera_file=grid.camera_file,
         notes=tuple(notes),
         transform=grid.transform,
         recovery=recovery,
         moves=grid.moves,
-        confirmed_viewmats=None if confirmed is None else place.frame.move_viewmats(confirmed),
+        confirmed_viewmats=None if confirmed is None else grid.frame.move_viewmats(confirmed),
     )

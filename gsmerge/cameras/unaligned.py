@@ -9,7 +9,7 @@ from itertools import product
 import numpy as np
 
 from gsmerge.cameras.frames import exporter_frames
-from gsmerge.cameras.grids import Grid, PlacedGrid, with_poses
+from gsmerge.cameras.grids import Grid, with_poses
 from gsmerge.cameras.poses import PosesInConvention, other_conventions
 from gsmerge.cameras.score import AlignmentInput, photo_colors
 from gsmerge.errors import SceneError
@@ -195,25 +195,25 @@ def choose_poses(
 
 def choose_cameras(
     inputs: AlignmentInput, grid: Grid, frames: Sequence[Similarity], no_pixels: SceneError
-) -> tuple[PlacedGrid, list[str]]:
+) -> tuple[Grid, list[str]]:
     """Choose the cameras that see the Gaussians: unchanged, in another frame, or in another convention.
 
     ``frames`` are the frames that a file gives, which are tried first. The usual frames of exporters are tried next.
     Returns the grid with these cameras, and notes. The error ``no_pixels`` explains why the rows have no pixels. If no
     cameras see the Gaussians, ``no_pixels`` is raised, with a sentence on what was tried.
     """
-    rows, unchanged = (inputs.gaussians, inputs.valid), PlacedGrid(grid, IDENTITY)
+    rows = inputs.gaussians, inputs.valid
     if frames:
         tried = (IDENTITY, *frames)
         checks = [check_cameras(*rows, frame.move_cameras(inputs.cameras), inputs.images) for frame in tried]
         best = tried[int(np.argmax([check.score * check.ok for check in checks]))]
         if best is not IDENTITY:
-            return replace(unchanged, frame=best), []
+            return replace(grid, frame=best), []
     poses, check, note = choose_poses(*rows, inputs.cameras, inputs.images, grid.camera_file.convention)
     frame = _choose_frame(inputs, check)
     if frame is not None:
         _check_colors(inputs, frame.move_cameras(inputs.cameras), frame.description, no_pixels)
-        return PlacedGrid(grid, frame, "photos' colours"), []
+        return replace(grid, frame=frame, shown_by="photos' colours"), []
     if not check.ok:
         remedy = f"{no_pixels.remedy}, or write their shift (x y z) to offset.txt beside the file"
         if check.share_seen > 0.5:  # the views see most Gaussians, so only the colours contradict the cameras
@@ -221,10 +221,10 @@ def choose_cameras(
             remedy += " the cameras, and --hint colors=rgb reads f_dc as RGB"
         raise SceneError(no_pixels.path, f"{no_pixels.problem}; {check.description}", remedy)
     if poses is None:
-        return unchanged, [note] if note else []
+        return grid, [note] if note else []
     cameras = replace(inputs.cameras, viewmats=poses.viewmats)
     _check_colors(inputs, cameras, f"read as {poses.description}", no_pixels)
-    return replace(unchanged, grid=with_poses(grid, poses)), []
+    return with_poses(grid, poses), []
 
 
 def _check_colors(inputs: AlignmentInput, cameras: Cameras, name: str, no_pixels: SceneError) -> None:

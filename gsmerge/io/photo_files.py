@@ -108,33 +108,42 @@ def decode_images(paths: Sequence[Path]) -> PhotoArrays:
     return decode_photos(paths, [0] * len(paths), size) if files else []
 
 
-def _check_total_memory(paths: Sequence[Path], file_bytes: int, size: Size) -> None:
-    """Raise SceneError if all photos of a scene together take more memory than the bytes of their files allow."""
-    num_bytes = _CHANNELS * len(paths) * size[0] * size[1]
-    max_bytes = _FREE_PHOTOS + _PHOTOS_PER_BYTE * file_bytes
-    if num_bytes > max_bytes:
-        problem = f"expected photos of at most {max_bytes / 1e6:,.0f} MB together from files of {file_bytes:,} bytes"
-        found = f"found {len(paths):,} of {size[0]} x {size[1]}, {num_bytes / 1e6:,.0f} MB"
-        raise SceneError(paths[0].parent, f"{problem}, {found}", "reduce their size, or leave some out")
-
-
-def decode_photos(paths: Sequence[Path | None], turns: Sequence[int], size: Size, part: Part = WHOLE) -> PhotoArrays:
+def decode_photos(
+    paths: Sequence[Path | None],
+    turns: Sequence[int],
+    size: Size,
+    part: Part = WHOLE,
+    damaged: dict[Path, str] | None = None,
+) -> PhotoArrays:
     """Decode the photo of each view, turn it upright, and resize a ``part`` of it to ``[h,w,3]`` uint8 of one ``size``.
 
     ``turns`` are those of :func:`orientation_turn`. A view without a file gets a black photo. If all photos together
     are large, they are decoded at each use. Otherwise each photo is decoded once, even if several views have the same
-    photo. Raise SceneError as in :func:`decode_images`.
+    photo. Raise SceneError as in :func:`decode_images`; but if ``damaged`` is given, a photo that cannot be decoded is
+    black, and ``damaged`` gets its path and the reason.
     """
     files = list(dict.fromkeys(path for path in paths if path is not None))
     sizes = {path: image_size(path) for path in files}
-    _check_total_memory([path for path in paths if path is not None], sum(map(check_file, files)), size)
+    count, file_bytes = sum(path is not None for path in paths), sum(map(check_file, files))
+    num_bytes, max_bytes = _CHANNELS * count * size[0] * size[1], _FREE_PHOTOS + _PHOTOS_PER_BYTE * file_bytes
+    if num_bytes > max_bytes:
+        problem = f"expected photos of at most {max_bytes / 1e6:,.0f} MB together from files of {file_bytes:,} bytes"
+        found = f"found {count:,} of {size[0]} x {size[1]}, {num_bytes / 1e6:,.0f} MB"
+        raise SceneError(files[0].parent, f"{problem}, {found}", "reduce their size, or leave some out")
 
     def decode(view: tuple[Path | None, int]) -> np.ndarray:
         """Decode, turn, cut and resize the photo of a ``view``, given as the photo's path and turn."""
         path, turn = view
         if path is None:
             return np.zeros((size[1], size[0], 3), np.uint8)
-        photo = np.ascontiguousarray(cut_part(turn_picture(decode_image(path, sizes[path]), turn), part))
+        try:
+            whole = decode_image(path, sizes[path])
+        except SceneError as error:
+            if damaged is None:
+                raise
+            damaged[path] = error.problem
+            return np.zeros((size[1], size[0], 3), np.uint8)
+        photo = np.ascontiguousarray(cut_part(turn_picture(whole, turn), part))
         photo_size = photo.shape[1], photo.shape[0]
         return photo if photo_size == size else resize_to(photo_size, size).photos([photo])[0]
 

@@ -221,7 +221,9 @@ def find_scene_files(
     named = frozenset(name for name, value in {**given, "protect": protect}.items() if value is not None)
     camera_path, image_path, mask_path = map(named_path, given.values())
     protect = named_path(protect)
-    _check_folders(masks=mask_path, protect=protect)
+    for option, folder in (("masks", mask_path), ("protect", protect)):
+        if folder is not None and not folder.is_dir():
+            raise SceneError(folder, f"expected a folder of pictures for --{option}, found a file", "name its folder")
     if path.suffix.lower() == STATE_ENDING and not os.path.isdir(path):
         check_file(path)
         own_views = path if cameras is None and _holds_views(path) else None
@@ -239,7 +241,12 @@ def find_scene_files(
     if cameras is None:
         camera_path, others, below = _find_camera_paths(ply, roots)
     if images is None:
-        image_path = _find_image_path(ply, camera_path, roots)
+        if camera_path is not None and (
+            camera_path.suffix == STATE_ENDING or (camera_path.suffix == ".npz" and holds_images(camera_path))
+        ):
+            image_path = camera_path
+        else:
+            image_path = _find_pictures("images", IMAGE_PLACES, roots, ply)
     if masks is None:
         photo_roots = filter((image_path or roots[0]).is_relative_to, roots)
         nearest = max(photo_roots, key=lambda root: len(root.parts), default=roots[0])
@@ -275,13 +282,6 @@ def _find_camera_paths(ply: Path, roots: Sequence[Path]) -> tuple[Path | None, l
     below = dict.fromkeys(p for top, _ in folders for p in list_cameras(top) if not _is_in_other_scene(p, top, ply))
     unread = next(filter(None, map(find_unread, roots)), None)
     return unread or of_result, [*islice(below, max_cameras)], bool(below)
-
-
-def _find_image_path(ply: Path, cameras: Path | None, roots: Sequence[Path]) -> Path | None:
-    """Find the images of a scene, inside the file of its cameras or in a folder; None if there are none."""
-    if cameras is not None and (cameras.suffix == STATE_ENDING or (cameras.suffix == ".npz" and holds_images(cameras))):
-        return cameras
-    return _find_pictures("images", IMAGE_PLACES, roots, ply)
 
 
 def _find_pictures(option: str, places: Sequence[str], roots: Sequence[Path], ply: Path) -> Path | None:
@@ -357,13 +357,6 @@ def _search_roots(path: Path, ply: Path, within: StrPath | None) -> tuple[list[P
     return list(dict.fromkeys(own)), [place for place in dict.fromkeys(shared) if place not in own]
 
 
-def _check_folders(**folders: Path | None) -> None:
-    """Raise SceneError if a path is no folder. Each keyword is the option that named the path."""
-    for option, path in folders.items():
-        if path is not None and not path.is_dir():
-            raise SceneError(path, f"expected a folder of pictures for --{option}, found a file", "name its folder")
-
-
 def _list_between(folder: Path, top: Path) -> list[Path]:
     """List the folders above a folder up to ``top``, the nearest first; empty if ``top`` is not above ``folder``."""
     return [above for above in folder.parents if above.is_relative_to(top)] if folder.is_relative_to(top) else []
@@ -421,20 +414,16 @@ def find_plys(folder: Path, cameras: Path | None = None) -> list[Path]:
     plys = list_plys(folder)
     if not plys:
         raise _no_gaussians(folder)
-    if len(plys) == 1 or _are_copies(plys):
-        return plys[:1]
+    if len(plys) == 1:
+        return plys
+    with suppress(OSError):  # numbered files may be copies: Flash3D writes one for each rendered view
+        if _are_numbered(plys) and all(filecmp.cmp(plys[0], path, shallow=False) for path in plys[1:]):
+            return plys[:1]
     in_one_folder = len({path.parent for path in plys}) == 1
     parts = _order_parts(folder, plys, cameras or find_cameras(folder)) if in_one_folder else None
     if parts is None:
         raise _several_scenes(folder, plys)
     return parts
-
-
-def _are_copies(plys: Sequence[Path]) -> bool:
-    """Return whether files are numbered and have the same bytes. Flash3D writes a copy for each rendered view."""
-    with suppress(OSError):
-        return _are_numbered(plys) and all(filecmp.cmp(plys[0], path, shallow=False) for path in plys[1:])
-    return False
 
 
 def _are_numbered(plys: Sequence[Path]) -> bool:
@@ -539,25 +528,19 @@ def _order_parts(folder: Path, plys: Sequence[Path], cameras: Path | None) -> li
             first, last = path_of[numbers[0]].name, path_of[numbers[-1]].name
             problem = f"expected all parts from {first} to {last}, found no part with the number {missing}"
             raise SceneError(folder, problem, "add the missing part, or name one of the files")
-    elif plys[0].parent.name == SCENES_PLACE or not _has_camera_for_each(plys, cameras):
+    elif plys[0].parent.name == SCENES_PLACE or cameras is None or len({header_counts(path) for path in plys}) > 1:
         return None
-    return None if any(map(_has_own_camera, plys)) else [path_of[number] for number in numbers]
-
-
-def _has_own_camera(path: Path) -> bool:
-    """Return whether a ``.ply`` holds its camera; False if the camera is damaged."""
-    with suppress(SceneError):  # the reader of the file reports the damage
-        return read_sharp_camera(path) is not None
-    return False
-
-
-def _has_camera_for_each(plys: Sequence[Path], cameras: Path | None) -> bool:
-    """Return whether all files have the same number of Gaussians, and ``cameras`` has a camera for each file."""
-    if cameras is None or len({header_counts(path) for path in plys}) > 1:
-        return False
-    with suppress(SceneError):
-        return len(read_cameras(cameras)) == len(plys)
-    return False
+    else:
+        num_cameras = 0
+        with suppress(SceneError):
+            num_cameras = len(read_cameras(cameras))
+        if num_cameras != len(plys):
+            return None
+    for path in plys:
+        with suppress(SceneError):  # the reader of the file reports a damaged camera
+            if read_sharp_camera(path) is not None:
+                return None
+    return [path_of[number] for number in numbers]
 
 
 def named_ply(folder: Path) -> Path | None:

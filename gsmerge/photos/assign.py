@@ -65,10 +65,6 @@ class _Scores:
         """Return the score of an assigned photo in a view; NaN if only the photo or only the view is portrait."""
         return float(self.values[view, self.photos.index(assignment.photo), assignment.orientation])
 
-    def has_shape(self, assignment: Assignment) -> bool:
-        """Return True if the oriented photo is portrait or landscape as the views are."""
-        return bool(np.isfinite(self.values[:, self.photos.index(assignment.photo), assignment.orientation]).any())
-
     def best(self) -> np.ndarray:
         """Return the score ``[v,p]`` of each photo in each view, in the best orientation."""
         return np.nan_to_num(self.values, nan=-np.inf).max(2)
@@ -177,8 +173,11 @@ class Assigner:
         if not named_pairs:
             return out, confirmed
         scores = self.score_in_views(photo for _, photo in named_pairs)
-        proposed = {view: Assignment(photo, self._stored_or_tagged(scores, view, photo)) for view, photo in named_pairs}
-        columns = [scores.photos.index(photo) for _, photo in named_pairs]
+        columns, proposed = [scores.photos.index(photo) for _, photo in named_pairs], dict[int, Assignment]()
+        for (view, photo), column in zip(named_pairs, columns, strict=True):  # as stored, unless its tag fits better
+            tag = self.candidates.tag(photo)
+            stored, tagged = np.nan_to_num(scores.values[view, column, [0, tag]], nan=-np.inf)
+            proposed[view] = Assignment(photo, tag if tagged > stored + SIGNIFICANT else 0)
         best = scores.best()[np.ix_(list(proposed), columns)]  # scores of each proposed view with each proposed photo
         own = np.nan_to_num([scores.of(*pair) for pair in proposed.items()], nan=-np.inf)  # of photos in their views
         matched = _match_columns(best)
@@ -191,9 +190,11 @@ class Assigner:
             is_similar = score > least or correlation**2 > MIN_EXPLAINED
             matches = is_similar and score > highest - SIGNIFICANT
             is_clear = score > NOISE_MARGIN and score >= highest
+            # a photo that is portrait or landscape as the views are
+            has_shape = bool(np.isfinite(scores.values[:, columns[row], assignment.orientation]).any())
             if is_clear and exact:
                 out[view], confirmed[view] = assignment, True
-            elif matches or (not self.has_contrast[view] and scores.has_shape(assignment)):
+            elif matches or (not self.has_contrast[view] and has_shape):
                 similarity = self.compare_parts(view, assignment)
                 out[view] = None if self.is_displaced(view, proposed) else assignment
                 confirmed[view] = bool(similarity) or (is_clear and similarity is None) or not self.has_contrast[view]
@@ -223,12 +224,6 @@ class Assigner:
             if assignment is not None and self.has_contrast[view]
         ]
         return not own_scores or _exceed_noise(np.array(own_scores))
-
-    def _stored_or_tagged(self, scores: _Scores, view: int, photo: int) -> int:
-        """Return the orientation in a photo's tag if it scores clearly higher than the stored orientation, else 0."""
-        tag = self.candidates.tag(photo)
-        stored, tagged = np.nan_to_num(scores.values[view, scores.photos.index(photo), [0, tag]], nan=-np.inf)
-        return tag if tagged > stored + SIGNIFICANT else 0
 
     def search(self, views: Sequence[int], photos: Sequence[int]) -> dict[int, Assignment]:
         """Find which of ``photos`` show ``views``, and return the assignment of each view that a photo shows.

@@ -144,7 +144,7 @@ def read_masks(
 
     masks, protecting = list_by_view(photo_masks), list_by_view(photo_protecting)
     turns = photos.turns or (0,) * len(masks)
-    mask_files = MaskFiles(tuple(paths), turns, masks, protecting, photos.part, stored, cut, cameras)
+    mask_files = MaskFiles(tuple(paths), turns, masks, protecting, photos.fit.part, stored, cut, cameras)
     counts, importance = zip(*parallel_map(mask_files.read, range(len(masks))), strict=True)
     error, place = (CameraMaskError, camera_file.path) if by_cameras else (SceneError, files.masks or "")
     _refuse_photos(error, place, "masks", masks, photos.pictures)

@@ -10,7 +10,7 @@ import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path, PurePath
 
@@ -25,11 +25,8 @@ from gsmerge.io.cameras.table import FFGS
 from gsmerge.io.first_bytes import CONVERT
 from gsmerge.io.image_names import IMAGE_SUFFIXES, find_image, list_images, natural_order, propose_images
 from gsmerge.io.photo_files import (
-    WHOLE,
-    Part,
     PhotoArrays,
     Size,
-    decode_image,
     decode_images,
     decode_photos,
     decode_small,
@@ -40,9 +37,9 @@ from gsmerge.io.photo_files import (
 )
 from gsmerge.io.scene_files import SceneFiles
 from gsmerge.kernels.pictures import turn_picture
-from gsmerge.photos.assign import Assigner, Assignment, Candidates, assign_photos
+from gsmerge.photos.assign import Assigner, Candidates, assign_photos
 from gsmerge.photos.colors import cut_blocks
-from gsmerge.photos.grid_fit import WHOLE_FIT, GridFit, PartFit, choose_fit, has_bars, list_fits
+from gsmerge.photos.grid_fit import WHOLE_FIT, GridFit, PartFit, choose_fit, list_fits
 from gsmerge.photos.offsets import OFFSET_PIXELS, correlate_parts
 from gsmerge.photos.photo_folders import capture_folder, count_pixels, find_named_photos
 from gsmerge.photos.pictures import Pairs, ViewPictures, show_views
@@ -57,15 +54,28 @@ UNNAMED = "view 0"  # name of the first camera if its file has no names, or if c
 
 @dataclass(frozen=True, eq=False)
 class ScenePhotos:
-    """The photos of c cameras, all of one size, and their files."""
+    """The photo of each of c cameras, and the files from which it is chosen.
 
-    pictures: PhotoArrays = ()  # [h,w,3] uint8 each, black for a camera without a photo; empty without photos
-    paths: tuple[Path | None, ...] = ()  # None for a camera without a photo; empty if the photos are inside a file
-    turns: tuple[int, ...] = ()  # orientation of each file, 0 to 7; see gsmerge.kernels.pictures.turn_picture
-    part: Part = WHOLE  # the part of each upright photo that is used
+    Names or order propose a file for each camera (:func:`find_photos`). The content of the photos then decides
+    (:func:`assign_to_views`), and the chosen files are read (:func:`read_photos`). Photos inside another file have only
+    ``pictures``.
+    """
 
-    def __len__(self) -> int:
-        return len(self.pictures)
+    folder: Path = Path()
+    pool: tuple[Path, ...] = ()  # all files
+    named: tuple[Path | None, ...] = ()  # the file that is proposed for each camera; None without one
+    exact: bool = False  # True: names propose the files; False: their order does
+    by_names: bool = False  # True: the folder was found by the names of its files
+    paths: tuple[Path | None, ...] = ()  # the photo of each camera; None for a camera without a photo
+    turns: tuple[int, ...] = ()  # orientation of each photo, 0 to 7; see gsmerge.kernels.pictures.turn_picture
+    faults: tuple[str | None, ...] = ()  # for each camera, why its photo cannot be used; None for no fault
+    fit: PartFit = WHOLE_FIT  # the part of each upright photo that is used
+    grid_fit: GridFit | None = None  # how files are resized and cropped to the grid of rows, if cameras are estimated
+    explain_most: bool = False  # True: the proposed photos explain what most views show
+    notes: tuple[str, ...] = ()  # notes on the used part
+    pictures: PhotoArrays = ()  # [h,w,3] uint8 each, black for a camera without a photo; empty before they are read
+    # Files that turned out to be damaged when their ``pictures`` were decoded, each with the reason; they are black
+    damaged: dict[Path, str] = field(default_factory=dict)
 
     @property
     def absent(self) -> list[int]:
@@ -75,90 +85,33 @@ class ScenePhotos:
     @property
     def file_size(self) -> Size | None:
         """Most frequent size of the used part of upright photos; of several, the largest; None without photos."""
-        sizes = [
-            part_size(_upright_size(path, turn), self.part)
-            for path, turn in zip(self.paths, self.turns, strict=True)
-            if path is not None
-        ]
+        sizes = self.list_sizes()
         return max(set(sizes), key=lambda size: (sizes.count(size), size[0] * size[1])) if sizes else None
 
+    def list_sizes(self) -> list[Size]:
+        """List the size of the used part of each photo when it is upright."""
+        stored = [(image_size(path), turn) for path, turn in zip(self.paths, self.turns, strict=True) if path]
+        return [part_size(size[::-1] if turn % 2 else size, self.fit.part) for size, turn in stored]
 
-@dataclass(frozen=True)
-class Proposal:
-    """Files that may be photos of c cameras, and the file that is proposed for each camera."""
-
-    folder: Path
-    pool: tuple[Path, ...]  # all files
-    named: tuple[int | None, ...]  # for each camera, the index of its file in the pool; None without a proposed file
-    exact: bool  # True: names propose the files; False: their order does
-    faults: tuple[str | None, ...] = ()  # for each camera, why its photo cannot be used; None for no fault
-    by_names: bool = False  # True: the folder was found by the names of its files
-    fit: PartFit = WHOLE_FIT  # the part of each photo that is used
-    notes: tuple[str, ...] = ()  # notes on the used part
-
-    def tag(self, photo: int) -> int:
-        """Return the orientation, 0 to 7, in the tag of a file of the pool."""
-        return orientation_turn(self.pool[photo])
-
-    @property
-    def paths(self) -> list[Path | None]:
-        """The proposed file of each camera."""
-        return [None if photo is None else self.pool[photo] for photo in self.named]
-
-    @property
-    def choice(self) -> list[Assignment | None]:
-        """The proposed file of each camera, in the orientation in which it is stored."""
-        return [None if photo is None else Assignment(photo, 0) for photo in self.named]
-
-    def without_views(self, cameras: Sequence[int]) -> Proposal:
-        """Return a copy in which ``cameras`` have a fault: a camera is unknown if its view has no Gaussians."""
-        faults = list(self.faults)
-        for camera in cameras:
-            path = self.paths[camera]
-            name = f"view {camera}" if path is None else _short_path(path, self)
-            faults[camera] = f"{name}: its camera is unknown, since no Gaussian belongs to it"
-        return replace(self, faults=tuple(faults))
-
-    def without_files(self, faults: Mapping[Path, str]) -> Proposal:
-        """Return a copy without the files in ``faults``, which maps files to the reasons why they cannot be used.
+    def without_files(self, reasons: Mapping[Path, str]) -> ScenePhotos:
+        """Return a copy without files that cannot be used, each with the reason.
 
         The reason becomes a fault of the cameras for which the file was proposed.
         """
-        pool = tuple(path for path in self.pool if path not in faults)
-        ids = {path: number for number, path in enumerate(pool)}
-        camera_faults = (
-            fault if path not in faults or path is None else f"{_short_path(path, self)}: {faults[path]}"
-            for path, fault in zip(self.paths, self.faults, strict=True)
+        if not reasons:
+            return self
+        faults = [*self.faults]
+        for view, path in enumerate(self.named):
+            if path is not None and path in reasons:
+                faults[view] = f"{_short_path(path, self)}: {reasons[path]}"
+        pool = tuple(path for path in self.pool if path not in reasons)
+        named, paths = (
+            tuple(None if path in reasons else path for path in files) for files in (self.named, self.paths)
         )
-        named = (None if path is None else ids.get(path) for path in self.paths)
-        return replace(self, pool=pool, named=tuple(named), faults=tuple(camera_faults))
-
-    def without_unreadable(self, *, decode: bool) -> Proposal:
-        """Return a copy without proposed files whose headers (with ``decode``, whose pixels) cannot be read."""
-        paths = [path for path in dict.fromkeys(self.paths) if path is not None]
-        faults = parallel_map(lambda path: _find_fault(path, decode=decode), paths)
-        return self.without_files({path: fault for path, fault in zip(paths, faults, strict=True) if fault})
-
-    def without_broken(self) -> Proposal | None:
-        """Return a copy without the proposed files that cannot be decoded; None if all or none can be decoded."""
-        sound = self.without_unreadable(decode=True)
-        return None if len(sound.pool) == len(self.pool) or not any(sound.choice) else sound
-
-    def select_views(self, cameras: Sequence[int]) -> Proposal:
-        """Return a copy for ``cameras`` alone."""
-        named = tuple(self.named[camera] for camera in cameras)
-        return replace(self, named=named, faults=tuple(self.faults[camera] for camera in cameras))
+        return replace(self, pool=pool, named=named, paths=paths, faults=tuple(faults))
 
 
-@dataclass(frozen=True, eq=False)
-class ViewPhotos:
-    """The photo of each view of a scene, as the content of the photos shows it."""
-
-    proposal: Proposal  # the files; views with a guessed camera have a fault
-    chosen: list[Assignment | None]  # for each view, its file and orientation; None without a photo
-    explain_most: bool  # True: the proposed photos explain most views
-    may_be_parts: bool  # True: only a part of each photo may show its view
-    fit: GridFit | None  # how files are resized and cropped to the grid of rows; None if cameras are not estimated
+NO_PHOTOS = ScenePhotos()
 
 
 def is_without_names(camera_file: CameraFile) -> bool:
@@ -166,19 +119,26 @@ def is_without_names(camera_file: CameraFile) -> bool:
     return camera_file.source == ESTIMATED and camera_file.names[0] == UNNAMED
 
 
-def propose_photos(files: SceneFiles, camera_file: CameraFile) -> Proposal | None:
-    """Propose a photo file for every camera by names, or if no name fits, by order if there is one file per camera.
+def find_photos(files: SceneFiles, camera_file: CameraFile) -> ScenePhotos:
+    """Find a photo for every camera by names, or if no name fits, by order if there is one file per camera.
 
-    Files that cannot be read are left out. None if there are no files of photos.
+    Files that cannot be read are left out. Photos inside another file are read. The result is :data:`NO_PHOTOS` if
+    there are none.
     """
     names = camera_file.names
     if files.images is None and "images" not in files.named:
         folder, pool, named = _find_photos_near(files, camera_file)
-    elif files.images is not None and files.images.is_dir():
+    elif files.images is None:  # the user wants no photos
+        return NO_PHOTOS
+    elif files.images.is_dir():
         folder, pool = files.images, list_images(files.images)
         named = propose_images(folder, pool, names, count_pixels)
-    else:  # the user wants no photos, or the photos are inside a file
-        return None
+    else:
+        same_file = files.cameras is not None and os.path.realpath(files.cameras) == os.path.realpath(files.images)
+        pictures = (camera_file if same_file else read_cameras(files.images)).images
+        if len(pictures) != len(names):
+            raise SceneError(files.images, f"expected {len(names)} images, one per camera, found {len(pictures)}")
+        return ScenePhotos(pictures=pictures)
     better = None  # another folder, in which more cameras have a photo by name
     if "images" not in files.named and len(known := {*named} - {None}) < len(names) and names[0] != UNNAMED:
         roots = dict.fromkeys(path.absolute() for path in (capture_folder(Path(camera_file.path)), files.root) if path)
@@ -188,15 +148,24 @@ def propose_photos(files: SceneFiles, camera_file: CameraFile) -> Proposal | Non
     if not any(named) and len(pool) == len(names):
         named = list(pool)
     if not pool:
-        return None
+        return NO_PHOTOS
     faults = tuple(
         _describe_missing_file(folder, name) if exact and path is None else None
         for name, path in zip(names, named, strict=True)
     )
-    ids = {path: number for number, path in enumerate(pool)}
-    photos = tuple(None if path is None else ids.get(path) for path in named)
-    proposal = Proposal(folder, tuple(pool), photos, exact, faults, by_names=better is not None)
-    return proposal.without_unreadable(decode=False)
+    photos = ScenePhotos(
+        folder,
+        pool=tuple(pool),
+        named=tuple(named),
+        exact=exact,
+        by_names=better is not None,
+        paths=tuple(named),
+        turns=(0,) * len(names),
+        faults=faults,
+    )
+    paths = list(dict.fromkeys(path for path in named if path is not None))
+    reasons = zip(paths, parallel_map(_check_header, paths), strict=True)
+    return photos.without_files({path: reason for path, reason in reasons if reason is not None})
 
 
 def _find_photos_near(files: SceneFiles, camera_file: CameraFile) -> tuple[Path, list[Path], list[Path | None]]:
@@ -229,12 +198,10 @@ def _describe_missing_file(folder: Path, name: str) -> str:
     return f"{short}: no such file, and the format of {min(unread)} is not read; {CONVERT}"
 
 
-def _find_fault(path: Path, *, decode: bool = False) -> str | None:
-    """Return why the header of an image file (with ``decode``, its pixels) cannot be read; None if it can be read."""
+def _check_header(path: Path) -> str | None:
+    """Return why the header of an image file cannot be read; None if it can be read."""
     try:
-        size = image_size(path)
-        if decode:
-            decode_image(path, size)
+        image_size(path)
     except SceneError as error:
         return f"{error.problem}; {CONVERT}" if error.remedy == CONVERT else error.problem
     return None
@@ -246,154 +213,144 @@ def stored_photos(files: SceneFiles, camera_file: CameraFile) -> PhotoArrays:
     Returns no photos if none exist. SceneError if a photo is missing or cannot be read, or if two photos differ in
     size.
     """
-    proposal = propose_photos(files, camera_file)
-    if proposal is None:
-        if files.images is not None and files.images.is_dir():
-            raise SceneError(files.images, f"expected photos of {len(camera_file)} cameras, found none")
-        return photos_inside(files, camera_file)
-    if None in proposal.named:
+    photos = find_photos(files, camera_file)
+    if photos is NO_PHOTOS and files.images is not None and files.images.is_dir():
+        raise SceneError(files.images, f"expected photos of {len(camera_file)} cameras, found none")
+    if not photos.named:
+        return photos.pictures
+    if None in photos.named:
         if files.images is None:  # photos that nobody named may be incomplete
             return ()
-        view = proposal.named.index(None)
-        reason = proposal.faults[view] or f"{camera_file.names[view]}: no such file"
-        raise SceneError(proposal.folder, f"expected a photo for each of {len(camera_file)} cameras, found {reason}")
-    return decode_images([proposal.pool[photo] for photo in proposal.named if photo is not None])
+        view = photos.named.index(None)
+        reason = photos.faults[view] or f"{camera_file.names[view]}: no such file"
+        raise SceneError(photos.folder, f"expected a photo for each of {len(camera_file)} cameras, found {reason}")
+    return decode_images([path for path in photos.named if path is not None])
 
 
-def photos_inside(files: SceneFiles, camera_file: CameraFile) -> PhotoArrays:
-    """Read the photos from the one file that has all photos; return no photos if the scene has no such file."""
-    if files.images is None or files.images.is_dir():
-        return ()
-    same_file = files.cameras is not None and os.path.realpath(files.cameras) == os.path.realpath(files.images)
-    stored = (camera_file if same_file else read_cameras(files.images)).images
-    if len(stored) != len(camera_file):
-        raise SceneError(files.images, f"expected {len(camera_file)} images, one per camera, found {len(stored)}")
-    return stored
+def read_photos(photos: ScenePhotos, camera_file: CameraFile) -> ScenePhotos:
+    """Read the photo of each camera upright, and resize it to the size of most photos.
 
-
-def read_photos(proposal: Proposal, chosen: Sequence[Assignment | None], camera_file: CameraFile) -> ScenePhotos:
-    """Read the chosen photo of each camera upright, and resize it to the size of most photos.
-
-    Photos of a camera file of SHARP are resized to the size of their camera. SceneError if a photo cannot be read, or
-    if its aspect ratio differs from that of most photos.
+    Photos of a camera file of SHARP are resized to the size of their camera. A damaged photo is black. SceneError if
+    the aspect ratio of a photo differs from that of most photos.
     """
-    paths = tuple(None if assignment is None else proposal.pool[assignment.photo] for assignment in chosen)
-    turns = tuple(0 if assignment is None else assignment.orientation for assignment in chosen)
-    photos = ScenePhotos(paths=paths, turns=turns, part=proposal.fit.part)
     size = photos.file_size
     if size is None:
-        return ScenePhotos()
+        return NO_PHOTOS
     if camera_file.source == SHARP:
         size = int(camera_file.widths[0]), int(camera_file.heights[0])
-    for path, turn in zip(paths, turns, strict=True):
-        used_size = size if path is None else part_size(_upright_size(path, turn), photos.part)
-        if camera_file.source != SHARP and not same_shape(used_size, size):
-            width, height = used_size
+    for width, height in () if camera_file.source == SHARP else photos.list_sizes():
+        if not same_shape((width, height), size):
             problem = f"expected photos with one aspect ratio, found {width} x {height} and {size[0]} x {size[1]}"
-            raise SceneError(proposal.folder, problem)
-    return replace(photos, pictures=decode_photos(paths, turns, proposal.fit.stretch(size), proposal.fit.part))
+            raise SceneError(photos.folder, problem)
+    damaged = dict[Path, str]()
+    pictures = decode_photos(photos.paths, photos.turns, photos.fit.stretch(size), photos.fit.part, damaged)
+    return replace(photos, pictures=pictures, damaged=damaged)
 
 
-def select_one_shape(camera_file: CameraFile, proposal: Proposal) -> tuple[CameraFile, Proposal, list[str]] | None:
+def keep_one_shape(camera_file: CameraFile, photos: ScenePhotos) -> tuple[CameraFile, ScenePhotos, list[str]]:
     """Leave out photos that lack the aspect ratio of most photos, and views whose cameras lack it.
 
-    A camera without a size has the aspect ratio of its photo. Returns the cameras and the photos of all other views,
-    and a doubt if views are left out. None if there are no photos, if all photos have one aspect ratio, or if fewer
-    than two views would remain.
+    If all cameras have one aspect ratio, all views are kept, and photos may lie on their side. A camera without a size
+    has the aspect ratio of its photo. Nothing is left out if fewer than two views would remain. Also return a doubt if
+    views are left out.
     """
-    paths = proposal.paths
-    sizes = {path: image_size(path) for path in paths if path is not None}
+    sizes = {path: image_size(path) for path in photos.named if path is not None}
     if not sizes:
-        return None
-    (width, height), _ = Counter(sizes[path] for path in paths if path is not None).most_common(1)[0]
-    shape = f"the aspect ratio of {width} x {height}"
-    # the photos with another aspect ratio, and their sizes as text
-    others = {path: "{} x {}".format(*size) for path, size in sizes.items() if not same_shape(size, (width, height))}
+        return camera_file, photos, []
+    (width, height), _ = Counter(sizes[path] for path in photos.named if path is not None).most_common(1)[0]
     camera_sizes = list(zip(camera_file.widths.tolist(), camera_file.heights.tolist(), strict=True))
+    are_alike = all(min(size) > 1 and same_shape(size, camera_sizes[0]) for size in camera_sizes)
+    shape = f"the aspect ratio of {width} x {height}"
+    others = {  # the photos with another aspect ratio
+        path: "{} x {}, not {}".format(*size, shape)
+        for path, size in sizes.items()
+        if not same_shape(size, (width, height)) and not (are_alike and same_shape(size, (height, width)))
+    }
     # a size of 1 pixel means that the camera has no size
     used = [
         view
-        for view, (path, size) in enumerate(zip(paths, camera_sizes, strict=True))
-        if (same_shape(size, (width, height)) if min(size) > 1 else path not in others)
+        for view, (path, size) in enumerate(zip(photos.named, camera_sizes, strict=True))
+        if are_alike or (same_shape(size, (width, height)) if min(size) > 1 else path not in others)
     ]
-    if len(used) < 2 or (len(used) == len(paths) and not others):
-        return None
-    unused = [camera_file.names[view] for view in range(len(paths)) if view not in used]
-    doubt = f"{len(unused)} of {len(paths)} views are left out, since they do not have {shape}: {list_some(unused)}"
-    fewer = proposal.without_files({path: f"{size}, not {shape}" for path, size in others.items()})
-    return select_views(camera_file, used), fewer.select_views(used), [Doubt(doubt)] if unused else []
+    if len(used) < 2:
+        return camera_file, photos, []
+    photos = photos.without_files(others)
+    unused = [camera_file.names[view] for view in range(len(camera_sizes)) if view not in used]
+    if not unused:
+        return camera_file, photos, []
+    named, faults = tuple(photos.named[view] for view in used), tuple(photos.faults[view] for view in used)
+    photos = replace(photos, named=named, paths=named, turns=(0,) * len(used), faults=faults)
+    doubt = f"{len(unused)} of {len(camera_sizes)} views are left out, since they do not have {shape}"
+    return select_views(camera_file, used), photos, [Doubt(f"{doubt}: {list_some(unused)}")]
 
 
-def _upright_size(path: Path, turn: int) -> Size:
-    """Return the size of a photo after it is turned to the orientation ``turn``."""
-    width, height = image_size(path)
-    return (height, width) if turn % 2 else (width, height)
+def _list_candidates(photos: ScenePhotos) -> Candidates:
+    """Make candidates of the files of photos, read small, cut to the used part, and fitted to a grid if they have one.
 
+    An unreadable photo is black, and fits no view.
+    """
 
-def _list_candidates(proposal: Proposal, fit: GridFit | None) -> Candidates:
-    """Make candidates of the files of a proposal, read small, and fitted to a grid by ``fit`` if it is given."""
-
-    def read(photo: int) -> np.ndarray:
+    def read(number: int) -> np.ndarray:
         """Read a small version of a photo, and cut out the part that is used."""
-        try:
-            small = decode_small(proposal.pool[photo], OFFSET_PIXELS)
-        except SceneError:  # an unreadable photo is black and fits no view
-            small = np.zeros((OFFSET_PIXELS, OFFSET_PIXELS, 3), np.float32)
-        small = proposal.fit.cut(small)
-        return small if fit is None else fit.cut(small)
+        small = np.zeros((OFFSET_PIXELS, OFFSET_PIXELS, 3), np.float32)
+        with suppress(SceneError):
+            small = decode_small(photos.pool[number], OFFSET_PIXELS)
+        small = photos.fit.cut(small)
+        return small if photos.grid_fit is None else photos.grid_fit.cut(small)
 
-    return Candidates(read, len(proposal.pool), proposal.tag)
+    return Candidates(read, len(photos.pool), lambda number: orientation_turn(photos.pool[number]))
 
 
-def assign_to_views(scene: Scene, proposal: Proposal, camera_file: CameraFile, *, read: bool) -> ViewPhotos:
+def assign_to_views(scene: Scene, photos: ScenePhotos, camera_file: CameraFile, *, read: bool) -> ScenePhotos:
     """Assign files to the views of a scene; see :func:`gsmerge.photos.assign.assign_photos`.
 
-    A view gets no photo if its camera is only a guess, because cameras were estimated and the view has no Gaussians.
-
-    Args:
-        scene: The scene.
-        proposal: The files.
-        camera_file: The cameras of the views.
-        read: True if the proposed files were read, and are the photos of the scene. If False, small versions are read.
+    If ``read`` is True, the proposed photos are the photos of the scene. If False, small versions of files are read. A
+    view gets no photo if its camera is only a guess, because cameras were estimated and the view has no Gaussians.
     """
-    fit = _fit_to_grid(scene, proposal) if is_without_names(camera_file) and proposal.pool else None
+    if is_without_names(camera_file) and photos.pool:
+        photos = replace(photos, grid_fit=_fit_to_grid(scene, photos))
     guessed = list[int]()
     if camera_file.source == ESTIMATED and scene.pixels is not None:
         guessed = np.flatnonzero(~scene.pixels.shown.any((1, 2))).tolist()
-    proposal, images = proposal.without_views(guessed), scene.images
-    candidates = stored = _list_candidates(proposal, fit)
+    candidates = stored = _list_candidates(photos)
+    ids, images = {path: number for number, path in enumerate(photos.pool)}, scene.images
+    named = [None if path is None else ids[path] for path in photos.named]
     if read and images is not None:
-        view_of_photo = {photo: view for view, photo in enumerate(proposal.named) if photo is not None}
+        view_of_photo = {photo: view for view, photo in enumerate(named) if photo is not None}
         candidates = replace(stored, read=lambda photo: images[view_of_photo[photo]])
-    # a view whose mask leaves out all pixels is compared as a whole
-    masks = None if scene.masks is None else scene.masks | ~scene.masks.any((1, 2), keepdims=True)
-    show = partial(show_views, replace(scene, masks=masks))
-    assigned, explain_most = assign_photos(show, candidates, proposal.named, exact=proposal.exact, stored=stored)
-    chosen = [None if view in guessed else assignment for view, assignment in enumerate(assigned)]
-    return ViewPhotos(proposal, chosen, explain_most, not explain_most or has_bars(images), fit)
+    show = partial(show_views, replace(scene, masks=None))
+    assigned, explain_most = assign_photos(show, candidates, named, exact=photos.exact, stored=stored)
+    faults = list(photos.faults)
+    for view in guessed:
+        path, assigned[view] = photos.named[view], None
+        name = f"view {view}" if path is None else _short_path(path, photos)
+        faults[view] = f"{name}: its camera is unknown, since no Gaussian belongs to it"
+    paths = tuple(None if assignment is None else photos.pool[assignment.photo] for assignment in assigned)
+    turns = tuple(0 if assignment is None else assignment.orientation for assignment in assigned)
+    return replace(photos, paths=paths, turns=turns, faults=tuple(faults), explain_most=explain_most)
 
 
-def _fit_to_grid(scene: Scene, proposal: Proposal) -> GridFit:
+def _fit_to_grid(scene: Scene, photos: ScenePhotos) -> GridFit:
     """Find how the photos that show a scene's views were resized and cropped to the grid of its rows."""
     fits = list_fits((scene.cameras.width, scene.cameras.height))
     shown, chosen = show_views(scene, OFFSET_PIXELS), list[np.ndarray | None]()
-    assigner = Assigner(partial(show_views, scene), _list_candidates(proposal, None))
-    for view, likely in assigner.list_likely(range(len(scene)), range(len(proposal.pool))).items():
-        photos = [turn_picture(assigner.candidates.read(photo), turn) for photo, turn in likely]
-        scores = [float(correlate_parts(shown, view, fits[0].cut(photo)).mean()) for photo in photos]
-        chosen.append(photos[int(np.argmax(scores))] if photos else None)
-    return choose_fit(shown, chosen, fits) if any(photo is not None for photo in chosen) else fits[0]
+    assigner = Assigner(partial(show_views, scene), _list_candidates(photos))
+    for view, likely in assigner.list_likely(range(len(scene)), range(len(photos.pool))).items():
+        pictures = [turn_picture(assigner.candidates.read(photo), turn) for photo, turn in likely]
+        scores = [float(correlate_parts(shown, view, fits[0].cut(picture)).mean()) for picture in pictures]
+        chosen.append(pictures[int(np.argmax(scores))] if pictures else None)
+    return choose_fit(shown, chosen, fits) if any(picture is not None for picture in chosen) else fits[0]
 
 
-def has_other_shape(proposal: Proposal, camera_file: CameraFile) -> bool:
+def has_other_shape(photos: ScenePhotos, camera_file: CameraFile) -> bool:
     """Return True if the first proposed photo, upright or turned, has another aspect ratio than all cameras.
 
     Another aspect ratio is expected if the cameras' source is known to resize or crop photos; the result is False then.
     """
-    photo, shapes = next((photo for photo in proposal.named if photo is not None), None), sizes_of(camera_file)
-    if photo is None or not shapes or camera_file.photo_map is not None or camera_file.source in (FFGS, SHARP):
+    first, shapes = next(filter(None, photos.named), None), sizes_of(camera_file)
+    if first is None or not shapes or camera_file.photo_map is not None or camera_file.source in (FFGS, SHARP):
         return False
-    size = proposal.fit.stretch(part_size(image_size(proposal.pool[photo]), proposal.fit.part))
+    size = photos.fit.stretch(part_size(image_size(first), photos.fit.part))
     return not any(same_shape(shape, turned) for shape in shapes for turned in (size, size[::-1]))
 
 
@@ -411,103 +368,81 @@ def has_nearer_colors(scene: Scene, other: Scene) -> bool:
     )
 
 
-def name_by_photos(camera_file: CameraFile, photos: ViewPhotos) -> CameraFile:
-    """Name estimated cameras by the photos of their views, and adapt the cameras to the ``fit`` of the photos.
+def name_by_photos(camera_file: CameraFile, photos: ScenePhotos) -> CameraFile:
+    """Name estimated cameras by the photos of their views, and adapt the cameras to the ``grid_fit`` of the photos.
 
     Cameras that were read from a file stay as they are.
     """
     if camera_file.source != ESTIMATED:
         return camera_file
-    proposal, chosen = photos.proposal, photos.chosen
-    files = [None if assignment is None else proposal.pool[assignment.photo] for assignment in chosen]
     names = [
-        name if file is None else _short_path(file, proposal)
-        for name, file in zip(camera_file.names, files, strict=True)
+        name if path is None else _short_path(path, photos)
+        for name, path in zip(camera_file.names, photos.paths, strict=True)
     ]
-    turns = [0 if assignment is None else assignment.orientation for assignment in chosen]
-    photo_size = ScenePhotos(paths=tuple(files), turns=tuple(turns), part=proposal.fit.part).file_size
-    named = replace(camera_file, names=tuple(names))
-    return named if photos.fit is None or photo_size is None else photos.fit.cameras(named, photo_size)
+    named, size = replace(camera_file, names=tuple(names)), photos.file_size
+    return named if photos.grid_fit is None or size is None else photos.grid_fit.cameras(named, size)
 
 
-def _short_path(path: Path, proposal: Proposal) -> str:
+def _short_path(path: Path, photos: ScenePhotos) -> str:
     """Return the path of a file relative to the folder of photos, or the names of its folder and file if outside it."""
-    folder = proposal.folder
+    folder = photos.folder
     return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else f"{path.parent.name}/{path.name}"
 
 
-def describe_assignment(photos: ViewPhotos, camera_file: CameraFile, *, are_pixels: bool) -> list[str]:
+def describe_assignment(photos: ScenePhotos, camera_file: CameraFile, *, are_pixels: bool) -> list[str]:
     """Describe where the assigned photos differ from names and tags, and why views have no photo.
 
-    ``are_pixels`` is explained at :func:`_describe_spare`.
+    Photos without a camera are noted if they lie in the folders of the used photos, since they may show other parts of
+    the scene. If each Gaussian belongs to a pixel of a view (``are_pixels``), the cameras of the views see the whole
+    scene; then photos without a camera are noted only if names propose photos, and if fewer photos lack a camera than
+    are used.
     """
-    proposal, chosen = photos.proposal, photos.chosen
-    folders = dict.fromkeys(str(proposal.pool[assignment.photo].parent) for assignment in chosen if assignment)
+    used = [(view, path) for view, path in enumerate(photos.paths) if path is not None]
+    folders = dict.fromkeys(str(path.parent) for _, path in used)
     place = f"photos are read from {list_some([*folders])}, whose files have the names of the cameras"
-    count, notes = len(chosen), [place] if proposal.by_names else []
-    turned = [
-        _short_path(proposal.pool[assignment.photo], proposal)
-        for assignment in chosen
-        if assignment is not None and assignment.orientation != proposal.tag(assignment.photo)
-    ]
+    count, notes = len(photos.paths), [place] if photos.by_names else []
+    turned = [_short_path(path, photos) for view, path in used if photos.turns[view] != orientation_turn(path)]
     if turned:
         text = f"{len(turned)} of {count} photos are turned or mirrored relative to their orientation tags"
         notes.append(f"{text}: {list_some(turned)}")
     moved = [
-        f"photo {_short_path(proposal.pool[assignment.photo], proposal)}"
-        f" for view {camera_file.names[view].removeprefix('view ')}"
-        for view, assignment in enumerate(chosen)
-        if assignment is not None and assignment.photo != proposal.named[view]
+        f"photo {_short_path(path, photos)} for view {camera_file.names[view].removeprefix('view ')}"
+        for view, path in used
+        if path != photos.named[view]
     ]
     if moved:
-        names = "names" if proposal.exact else "their order"
+        names = "names" if photos.exact else "their order"
         notes.append(f"photos are matched with views by their content, not by {names}: {list_some(moved)}")
-    notes += _describe_spare(proposal, chosen, are_pixels=are_pixels)
-    missing = [view for view, assignment in enumerate(chosen) if assignment is None]
-    if not missing:
+    stems = {path.stem for path in (*photos.paths, *photos.named) if path is not None}
+    spare = [path for path in photos.pool if str(path.parent) in folders and path.stem not in stems]
+    if spare and not (are_pixels and (not photos.exact or len(spare) >= len(used))):
+        text = f"{len(spare)} of {len(spare) + len(used)} photos {'has' if len(spare) == 1 else 'have'} no camera"
+        names = list_some([_short_path(path, photos) for path in spare])
+        notes.append(f"{text} and {'is' if len(spare) == 1 else 'are'} not used: {names}")
+    reasons = list[str]()
+    for view in photos.absent:
+        path, name = photos.named[view], camera_file.names[view]
+        shown = f"{name}: no photo shows this view"
+        if path is not None:
+            shown = f"{_short_path(path, photos)}: shows something else than its camera"
+        reasons.append(photos.faults[view] or shown)
+    if not reasons:
         return notes
-    reasons = [_explain_absence(proposal, view, camera_file.names[view]) for view in missing]
-    return [*notes, Doubt(f"photos of {len(missing)} of {count} views are left out: {list_some(reasons, '; ')}")]
+    return [*notes, Doubt(f"photos of {len(reasons)} of {count} views are left out: {list_some(reasons, '; ')}")]
 
 
-def _explain_absence(proposal: Proposal, view: int, name: str) -> str:
-    """Say why the camera of a view has no photo."""
-    path = proposal.paths[view]
-    if path is None:
-        return proposal.faults[view] or f"{name}: no photo shows this view"
-    return proposal.faults[view] or f"{_short_path(path, proposal)}: shows something else than its camera"
-
-
-def _describe_spare(proposal: Proposal, chosen: Sequence[Assignment | None], *, are_pixels: bool) -> list[str]:
-    """Note the photos without a camera in the folders of the used photos, since they may show other parts of the scene.
-
-    If each Gaussian belongs to a pixel of a view (``are_pixels``), the cameras of the views see the whole scene. With
-    ``are_pixels``, photos without a camera are noted only if names propose photos, and if fewer photos lack a camera
-    than are used.
-    """
-    used = [proposal.pool[assignment.photo] for assignment in chosen if assignment is not None]
-    named = [proposal.pool[photo] for photo in proposal.named if photo is not None]
-    folders, stems = {path.parent for path in used}, {path.stem for path in (*used, *named)}
-    spare = [path for path in proposal.pool if path.parent in folders and path.stem not in stems]
-    if not spare or (are_pixels and (not proposal.exact or len(spare) >= len(used))):
-        return []
-    count = f"{len(spare)} of {len(spare) + len(used)} photos {'has' if len(spare) == 1 else 'have'} no camera"
-    names = list_some([_short_path(path, proposal) for path in spare])
-    return [f"{count} and {'is' if len(spare) == 1 else 'are'} not used: {names}"]
-
-
-def describe_missing(names: Sequence[str], stored: CameraFile | SceneError | None, *, is_right: bool) -> str | None:
+def describe_missing(names: Sequence[str], stored: CameraFile | None, *, is_right: bool) -> str | None:
     """Say which views have no camera in a file, which is why all cameras are estimated instead of read from the file.
 
     Returns None if there is no such file, if it cannot be read, or if its cameras may be those of another scene.
 
     Args:
         names: Names of the views. A view has the name of its photo, if a photo shows it.
-        stored: The cameras of the file, or why the file cannot be read; None if there is no file.
+        stored: The cameras of the file; None if there is no file, or if it cannot be read.
         is_right: True if the cameras of the file see the Gaussians. Otherwise the cameras are taken for those of the
             scene only if every camera has the name of a view.
     """
-    if not isinstance(stored, CameraFile):
+    if stored is None:
         return None
     known, count = {PurePath(name).stem for name in stored.names}, len(names) - len(stored)
     lacking = [name for name in names if PurePath(name).stem not in known]
@@ -519,18 +454,18 @@ def describe_missing(names: Sequence[str], stored: CameraFile | SceneError | Non
     return f"{text}: the poses and focal length of all views are estimated from the Gaussians' own grid"
 
 
-def explain_mismatch(proposal: Proposal, camera_file: CameraFile) -> SceneError:
+def explain_mismatch(photos: ScenePhotos, camera_file: CameraFile) -> SceneError:
     """Return the error that no photo shows any view, with the names of the photos that cannot be used."""
     views = f"the {len(camera_file)} views of {camera_file.widths[0]} x {camera_file.heights[0]} pixels"
-    photos = "none that shows one of them"
-    if has_other_shape(proposal, camera_file) and camera_file.source != ESTIMATED:
-        width, height = image_size(next(proposal.pool[photo] for photo in proposal.named if photo is not None))
+    found = "none that shows one of them"
+    if has_other_shape(photos, camera_file) and camera_file.source != ESTIMATED:
+        width, height = image_size(next(filter(None, photos.named)))
         shape = " (2 : 1 as 360-degree panoramas have)" if width == 2 * height else ""
-        photos = f"{width} x {height}{shape}, of which no part shows one of them"
-    faults = [fault for fault in proposal.faults if fault is not None]
+        found = f"{width} x {height}{shape}, of which no part shows one of them"
+    faults = [fault for fault in photos.faults if fault is not None]
     reasons = f" ({list_some(faults, '; ')})" if faults else ""
-    problem = f"expected photos of {views}, found {photos}{reasons}"
-    return SceneError(proposal.folder, problem, "name their folder with --images")
+    problem = f"expected photos of {views}, found {found}{reasons}"
+    return SceneError(photos.folder, problem, "name their folder with --images")
 
 
 def without_photo(scene: Scene, views: Sequence[int]) -> Scene:

@@ -17,7 +17,7 @@ from gsmerge.io.cameras.dataparser import DATAPARSER
 from gsmerge.io.cameras.foreign import INTRINSICS
 from gsmerge.io.cameras.long_lrm import FRAMES_FILE
 from gsmerge.io.scene_files import SceneFiles
-from gsmerge.photos.scene_photos import propose_photos
+from gsmerge.photos.scene_photos import find_photos
 from gsmerge.values.words import count_words
 
 EXTRA_FILES = (DATAPARSER, INTRINSICS, FRAMES_FILE)  # read with some camera files
@@ -89,12 +89,12 @@ def list_photos(files: SceneFiles, cameras: Path) -> list[Path]:
     """List the photos that may show the views of a camera file, and the masks that the camera file names."""
     try:
         camera_file = read_cameras(cameras)
-        proposal = propose_photos(files, camera_file)
+        photos = find_photos(files, camera_file)
     except SceneError:  # the reader of the scene reports it
         return []
     root = cameras if cameras.is_dir() else cameras.parent
     masks = [root / name for name in camera_file.masks.values() if (root / name).is_file()]
-    return [*(() if proposal is None else proposal.pool), *masks]
+    return [*photos.pool, *masks]
 
 
 def scene_name(scene: Path) -> str:

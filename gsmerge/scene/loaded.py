@@ -14,6 +14,7 @@ from gsmerge.io.formats.arrays import FLAT_COMMENT
 from gsmerge.io.formats.read import FileInfo, kept_comments
 from gsmerge.io.scene_files import SceneFiles
 from gsmerge.scene.exporters import Exporter
+from gsmerge.scene.views import PhotoSource
 from gsmerge.types import Scene
 
 
@@ -37,6 +38,7 @@ class Loaded:
     joined: Sequence[dict[str, Any]] = ()  # where each of several joined scenes lies; empty for one scene
     photos_explain: bool = False  # whether the photos that names propose explain what most views show
     stats: Mapping[Path, tuple[int, ...]] = field(default_factory=dict)  # states of the files before they were read
+    source: PhotoSource | None = None  # the photos as stored, until larger photos and masks are read; then None
     sha256: str | None = None  # hash of the files of Gaussians, one after the other; None if it was not asked for
     own_views: int = 0  # number of views that the rows form, if the rows are not pixels of the cameras; else 0
 

@@ -1,45 +1,43 @@
-"""Read a scene from its files: its Gaussians, the pixels of their rows, its cameras and its photos.
-
-A function returns a :class:`SceneError` instead of raising it if the caller can try to read the scene in another way.
-"""
+"""Read a scene from its files: its Gaussians, the pixels of their rows, its cameras and its photos."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
+
+import numpy as np
 
 from gsmerge.cameras import NO_CAMERAS_USED, AlignmentResult, align, check_pixels
 from gsmerge.errors import Doubt, DoubtWarning, SceneError, name_notes
 from gsmerge.geometry.transforms import move_views
-from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, at_own_size, to_cameras
+from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, to_cameras
 from gsmerge.io.cameras.dataparser import read_dataparser
 from gsmerge.io.formats.arrays import MAX_STRAY, RESULT_COMMENT
 from gsmerge.io.formats.read import GaussianFile, file_notes, read_gaussians, read_parts
 from gsmerge.io.image_names import IMAGE_SUFFIXES, describe_unread
 from gsmerge.io.photo_files import NO_IMAGES, as_floats, photo_size
 from gsmerge.io.scene_files import IMAGE_PLACES, SceneFiles, find_scene_files, result_cameras
-from gsmerge.photos.assign import Assignment
-from gsmerge.photos.grid_fit import WHOLE_FIT
-from gsmerge.photos.masks import NO_MASKS, CameraMaskError, Masks, check_masks
+from gsmerge.photos.grid_fit import WHOLE_FIT, has_bars
+from gsmerge.photos.masks import CameraMaskError, check_masks
 from gsmerge.photos.parts import choose_part
 from gsmerge.photos.scene_photos import (
-    Proposal,
+    NO_PHOTOS,
     ScenePhotos,
     assign_to_views,
     describe_assignment,
     describe_missing,
     explain_mismatch,
+    find_photos,
     has_other_shape,
     is_without_names,
+    keep_one_shape,
     name_by_photos,
-    photos_inside,
-    propose_photos,
     read_photos,
-    select_one_shape,
     stored_photos,
     without_photo,
 )
@@ -54,16 +52,35 @@ from gsmerge.scene.exporters import (
     make_hints,
 )
 from gsmerge.scene.loaded import Loaded
-from gsmerge.scene.rows import confirm_colors, read_rotations, take_gaussians
-from gsmerge.scene.views import find_larger_and_masks, limit_photo_size, limit_view_size, read_scene_cameras
+from gsmerge.scene.rows import confirm_colors, take_gaussians
+from gsmerge.scene.views import (
+    PhotoSource,
+    find_larger_and_masks,
+    limit_photo_size,
+    limit_view_size,
+    read_scene_cameras,
+)
 from gsmerge.settings.reading import NONE, OpacityChoice
-from gsmerge.types import NO_CAMERAS, LargePhotos, Scene, StrPath
+from gsmerge.types import NO_CAMERAS, Scene, StrPath
 from gsmerge.values.arguments import check_arguments
 from gsmerge.values.words import count_words
 
-T = TypeVar("T")
 MakeScene = Callable[[CameraFile, ScenePhotos], Loaded]  # may raise SceneError
 SUMMED_FACTS = ("file_bytes", "num_nonfinite")  # facts about files that are added up if scenes are joined
+
+
+class Errors(list[SceneError]):
+    """The errors of attempts to read a scene. As a context, it takes the SceneError that its block raises."""
+
+    def __enter__(self) -> None:
+        """Begin an attempt."""
+
+    def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> bool:
+        """End an attempt; return whether it raised a SceneError, which is then in this list."""
+        if not isinstance(error, SceneError):
+            return False
+        self.append(type(error)(error.path, error.problem, error.remedy))  # a copy, as the traceback keeps arrays
+        return True
 
 
 @check_arguments
@@ -176,88 +193,169 @@ def read_gaussian_file(files: SceneFiles, *, opacity: OpacityChoice, hints: Read
     return read_parts(files.parts, **encodings) if files.parts else read_gaussians(files.ply, **encodings)
 
 
-def align_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHints = NO_HINTS, photos: bool = True) -> Loaded:
+def align_scene(
+    ply: GaussianFile,
+    files: SceneFiles,
+    *,
+    hints: ReadHints = NO_HINTS,
+    photos: bool = True,
+    keeps_cameras: bool = False,
+) -> Loaded:
     """Combine Gaussians, cameras and photos into a scene, with the pixel of every row if rows have pixels.
 
-    Cameras and photos that were found beside the scene, but do not belong to it, are left out with a note. Raises
-    SceneError as :func:`read_scene` does. If ``photos`` is False, no photos are searched.
-    """
-    result = _choose_cameras(ply, files, hints, photos=photos)
-    lacks_views = isinstance(result, Loaded) and result.own_views > len(result.scene)  # the rows form a larger grid
-    cameras_may_be_wrong = lacks_views or (
-        isinstance(result, SceneError) and "cameras" not in files.named and not _is_fault_of_named(files, result)
-    )
-    if cameras_may_be_wrong and files.cameras not in (None, files.ply):
-        result = _read_without_cameras(ply, files, hints, result, photos=photos)
-    if isinstance(result, Loaded):
-        return result
-    if "cameras" not in files.named:
-        _check_hints(ply, hints)
-    options = [f"--{name} {NONE}" for name in ("cameras", "images") if name in files.named and getattr(files, name)]
-    read_alone = f"{' and '.join(options)} reads the Gaussians alone" if options else ""
-    raise SceneError(result.path, result.problem, "; ".join(filter(None, (result.remedy, read_alone))))
-
-
-def _read_without_cameras(
-    ply: GaussianFile, files: SceneFiles, hints: ReadHints, result: Loaded | SceneError, *, photos: bool
-) -> Loaded | SceneError:
-    """Read a scene without its camera file, with a note; cameras are estimated from the rows instead.
-
-    ``result`` is the result of reading with the camera file: a scene with fewer views than the rows form, or an error.
-    ``result`` is returned if the scene cannot be read without the camera file, or only without photos that the caller
-    named.
-    """
-    remaining = replace(files, cameras=None, images=None if files.images == files.cameras else files.images)
-    load = _read_views(ply, remaining, hints, photos=photos)
-    needs_photos = "images" in files.named and files.images is not None
-    if isinstance(load, SceneError) or (needs_photos and load.scene.images is None):
-        return result
-    stored = _read_or_error(partial(read_scene_cameras, ply, files))
-    missing_cameras = describe_missing(load.scene.names, stored, is_right=isinstance(result, Loaded))
-    if missing_cameras is not None:
-        return replace(
-            load, notes=(missing_cameras, *(note for note in load.notes if not note.startswith(NO_CAMERAS_USED)))
-        )
-    return _note_left_out(load, files, [str(files.cameras)], result) if isinstance(result, SceneError) else result
-
-
-def _choose_cameras(ply: GaussianFile, files: SceneFiles, hints: ReadHints, *, photos: bool) -> Loaded | SceneError:
-    """Read a scene with its first camera file that certainly fits, or else with the first that can be read.
-
-    If there are several camera files, a note says which one is read. If none can be read, returns the first error.
-    """
-    loads, errors = list[Loaded](), list[SceneError]()
-    for choice in files.choices:
-        load = _read_views(ply, choice, hints, photos=photos)
-        if isinstance(load, SceneError):
-            errors.append(load)
-            continue
-        with_note = replace(load, notes=(*files.describe_choice(choice.cameras), *load.notes))
-        if _cameras_certainly_fit(load, files):
-            return with_note
-        loads.append(load if choice.cameras == files.cameras else with_note)
-    return loads[0] if loads else errors[0]
-
-
-def _cameras_certainly_fit(load: Loaded, files: SceneFiles) -> bool:
-    """Return whether the cameras of a scene certainly fit its Gaussians, so that no other cameras have to be tried.
+    The first camera file that certainly fits is used, or else the first that can be read. Cameras and photos that were
+    found beside the scene, but do not belong to it, are left out with a note. If no camera file that was found can be
+    read, or if rows form more views than it has, cameras are estimated from the rows, unless ``keeps_cameras`` is True.
+    Raises SceneError as :func:`read_scene` does. If ``photos`` is False, no photos are searched.
 
     - In a scene with photos, cameras certainly fit if rows are their pixels, if the photos show the views, or if there
       are no other cameras.
     - In a scene without photos, cameras certainly fit if no other cameras lie in folders below the scene, and if rows
       are pixels of the cameras or the scene has no doubts.
     """
-    if load.scene.images is None:
-        return not files.below and (load.scene.has_own_pixels or not load.doubts)
-    return load.scene.has_own_pixels or load.photos_explain or not files.others
+    best: Loaded | None = None
+    errors, certainly_fit = Errors(), False
+    for choice in files.choices:
+        with errors:
+            load = _read_views(ply, choice, hints, photos=photos)
+            if load.scene.images is None:
+                certainly_fit = not files.below and (load.scene.has_own_pixels or not load.doubts)
+            else:
+                certainly_fit = load.scene.has_own_pixels or load.photos_explain or not files.others
+            if certainly_fit or choice.cameras != files.cameras:
+                load = replace(load, notes=(*files.describe_choice(choice.cameras), *load.notes))
+            best = load if certainly_fit or best is None else best
+        if certainly_fit:
+            break
+    if best is None:
+        blames_named = "images" in files.named and Path(errors[0].path).is_relative_to(files.images or files.ply)
+        cameras_may_be_wrong = "cameras" not in files.named and not blames_named
+    else:
+        cameras_may_be_wrong = best.own_views > len(best.scene)  # the rows form a larger grid
+    if cameras_may_be_wrong and files.cameras not in (None, files.ply) and not keeps_cameras:
+        with suppress(SceneError):
+            best = _read_without_cameras(ply, files, hints, best, errors, photos=photos)
+    if best is not None:
+        return _add_larger_and_masks(confirm_colors(best))
+    if "cameras" not in files.named:
+        _check_hints(ply, hints)
+    options = [f"--{name} {NONE}" for name in ("cameras", "images") if name in files.named and getattr(files, name)]
+    read_alone = f"{' and '.join(options)} reads the Gaussians alone" if options else ""
+    raise SceneError(errors[0].path, errors[0].problem, "; ".join(filter(None, (errors[0].remedy, read_alone))))
 
 
-def _read_or_error(read: Callable[[], T]) -> T | SceneError:
-    """Return what ``read`` returns, or the SceneError that it raises."""
-    try:
-        return read()
-    except SceneError as error:
-        return type(error)(error.path, error.problem, error.remedy)  # a copy, as the traceback keeps arrays in memory
+def _read_without_cameras(
+    ply: GaussianFile, files: SceneFiles, hints: ReadHints, best: Loaded | None, errors: Errors, *, photos: bool
+) -> Loaded:
+    """Read a scene without its camera file, with a note; cameras are estimated from the rows instead.
+
+    ``best`` is the scene with the camera file, which has fewer views than the rows form; or None, for the first of the
+    ``errors``. Raises SceneError if the scene cannot be read without the camera file, or only without photos that the
+    caller named; returns ``best`` if nothing shows that the camera file lacks views.
+    """
+    remaining = replace(files, cameras=None, images=None if files.images == files.cameras else files.images)
+    load, stored = _read_views(ply, remaining, hints, photos=photos), None
+    if load.scene.images is None and "images" in files.named and files.images is not None:
+        raise SceneError(files.images, "expected photos of the views, found others")
+    with suppress(SceneError):
+        stored = read_scene_cameras(ply, files)
+    missing = describe_missing(load.scene.names, stored, is_right=best is not None)
+    if missing is None:
+        return best or _note_left_out(load, files, [str(files.cameras)], errors[0])
+    return replace(load, notes=(missing, *(note for note in load.notes if not note.startswith(NO_CAMERAS_USED))))
+
+
+def _read_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints, *, photos: bool) -> Loaded:
+    """Combine a scene's Gaussians with its cameras and photos, if any; raise SceneError if they do not fit together.
+
+    Photos that the caller named are never left out. Other photos that do not fit are left out, with a note, if it is
+    certain that the cameras belong to the scene: if rows are pixels of the cameras, if the photos cannot be read, or if
+    they were found by the cameras' names. Cameras that merely see the Gaussians may still belong to another scene. If
+    ``photos`` is False, no photos are searched.
+    """
+    camera_file = read_scene_cameras(ply, files)
+    if camera_file is None:
+        return _make_scene_without_views(ply, files, hints)
+    found, errors = NO_PHOTOS, Errors()
+    with errors:
+        found = find_photos(files, camera_file) if photos else NO_PHOTOS
+    if errors and ("images" in files.named or files.images == files.cameras):
+        raise errors[0]
+    if found.by_names:
+        files = replace(files, images=found.folder)
+    make_scene = partial(_make_scene_with_views, ply, files, hints)
+    if found.named:
+        with errors:
+            cameras, proposed, doubts = keep_one_shape(camera_file, found)
+            load = _make_with_photos(make_scene, cameras, proposed)
+            return replace(load, notes=(*load.notes, *doubts))
+    if not errors:  # there are no photos, or they are in one file
+        load = make_scene(camera_file, found)
+        lacks_photos = photos and "images" not in files.named and load.scene.images is None
+        is_result = RESULT_COMMENT in ply.info.comments or result_cameras(files.ply)  # films beside a result show it
+        notes_on_films = describe_unread(files.ply.parent, IMAGE_PLACES) if lacks_photos and not is_result else []
+        return replace(load, notes=(*load.notes, *notes_on_films))
+    cause, folder, bare = errors[0], found.folder if found.named else files.images, None
+    if "images" in files.named:  # the named photos are blamed, not cameras that were found
+        are_blamed = "cameras" not in files.named and cause.path == camera_file.path
+        raise explain_mismatch(found, camera_file) if are_blamed else cause
+    with errors:
+        bare = make_scene(camera_file, NO_PHOTOS)
+    is_photo = Path(cause.path).suffix.lower() in IMAGE_SUFFIXES or cause.path == str(folder) or not found.named
+    if bare is None or not (bare.scene.has_own_pixels or is_photo or found.by_names):
+        raise cause
+    return _note_left_out(bare, replace(files, images=folder), [f"the photos in {folder}"], cause)
+
+
+def _make_with_photos(make_scene: MakeScene, camera_file: CameraFile, photos: ScenePhotos) -> Loaded:
+    """Make a scene with the photos that names propose, or with other photos that show its views.
+
+    1. If the photos have another shape than the cameras, parts of the photos are used if they show the views.
+    2. The scene is made with the proposed photos, or if these photos cannot be used, without photos.
+    3. The views of this scene decide which photo belongs to a view. Parts of photos are used if the parts fit better.
+    4. If the views show photos other than the proposed ones, the scene is made again.
+
+    Notes name photos that cannot be read, and views without a photo. Raises SceneError if no photo shows a view.
+    """
+    has_no_names, pinholes = is_without_names(camera_file), replace(camera_file, lenses=())
+    shapes_differ = not has_no_names and has_other_shape(photos, camera_file)
+    # 1. Parts of photos of another shape
+    parts, base, errors = None, None, Errors()
+    if shapes_differ:
+        with suppress(SceneError):
+            parts = choose_part(make_scene(pinholes, NO_PHOTOS).scene, photos, camera_file)
+        if parts is not None:
+            return _make_with_photos(make_scene, camera_file, parts)
+    # 2. The base: the scene with the proposed photos, or without photos
+    if any(photos.named) and not has_no_names:
+        with errors:
+            read = read_photos(photos, camera_file)
+            base = make_scene(camera_file, read)
+            photos = photos.without_files(read.damaged)
+    are_read = base is not None
+    if base is None:
+        with errors:
+            base = make_scene(pinholes, NO_PHOTOS)
+    if base is None:
+        raise errors[0]
+    # 3. The photo of each view, whole or in part
+    checked = assign_to_views(base.scene, photos, camera_file, read=are_read)
+    show_most = checked.explain_most and not has_bars(base.scene.images)
+    if not show_most and photos.fit == WHOLE_FIT and not shapes_differ:
+        parts = choose_part(base.scene, photos, camera_file, checked.grid_fit)
+        if parts is not None:
+            return _make_with_photos(make_scene, camera_file, parts)
+    if not any(checked.paths) or (shapes_differ and not checked.explain_most):
+        # an error of photos of another shape says nothing, unless lenses may have changed the shape
+        if errors and (not shapes_differ or any(camera_file.lenses)):
+            raise errors[0]
+        raise explain_mismatch(checked, camera_file)
+    # 4. The scene with the photos of its views, unless the same photos were proposed
+    load = base
+    if not are_read or (checked.paths, checked.turns) != (photos.paths, photos.turns):
+        load = make_scene(name_by_photos(camera_file, checked), read_photos(checked, camera_file))
+    described = describe_assignment(checked, camera_file, are_pixels=base.scene.has_own_pixels)
+    return replace(load, notes=(*checked.notes, *load.notes, *described), photos_explain=checked.explain_most)
 
 
 def _note_left_out(load: Loaded, files: SceneFiles, left_out: list[str], cause: SceneError) -> Loaded:
@@ -280,172 +378,12 @@ def _note_left_out(load: Loaded, files: SceneFiles, left_out: list[str], cause: 
     )
 
 
-def _read_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints, *, photos: bool) -> Loaded | SceneError:
-    """Combine a scene's Gaussians with its cameras and photos, if any; return the error if they do not fit together."""
-    camera_file = _read_or_error(partial(read_scene_cameras, ply, files))
-    if camera_file is None:
-        return _make_scene_without_views(ply, files, hints)
-    if isinstance(camera_file, SceneError):
-        return camera_file
-    load = _add_photos(ply, files, camera_file, hints, photos=photos)
-    return confirm_colors(load) if isinstance(load, Loaded) else load
-
-
-def _add_photos(
-    ply: GaussianFile, files: SceneFiles, camera_file: CameraFile, hints: ReadHints, *, photos: bool
-) -> Loaded | SceneError:
-    """Combine Gaussians and cameras with their photos; return the error if the cameras do not see the Gaussians.
-
-    Each photo is a separate file, or one file has all photos. Photos that the caller did not name are left out, with a
-    note, if they cannot be read or do not show the views; see :func:`_leave_out_photos`. If ``photos`` is False, all
-    photos are left out.
-    """
-    proposal = _read_or_error(partial(propose_photos, files, camera_file)) if photos else None
-    if isinstance(proposal, Proposal) and proposal.by_names:
-        files = replace(files, images=proposal.folder)
-    inside = _read_or_error(partial(photos_inside, files, camera_file)) if photos and proposal is None else ()
-    error = next((value for value in (proposal, inside) if isinstance(value, SceneError)), None)
-    if error is not None and ("images" in files.named or files.images == files.cameras):
-        return error
-    if isinstance(proposal, Proposal):
-        return _add_proposed_photos(ply, files, camera_file, proposal, hints)
-    scene_photos = ScenePhotos(() if isinstance(inside, SceneError) else inside)
-    load = _read_or_error(partial(_make_scene_with_views, ply, files, hints, camera_file, scene_photos))
-    if isinstance(load, SceneError):
-        return load
-    if error is not None:
-        return _note_left_out(load, files, [f"the photos in {files.images}"], error)
-    lacks_photos = photos and "images" not in files.named and load.scene.images is None
-    is_result = RESULT_COMMENT in ply.info.comments or result_cameras(files.ply)  # films beside a result show it
-    notes_on_films = describe_unread(files.ply.parent, IMAGE_PLACES) if lacks_photos and not is_result else []
-    return replace(load, notes=(*load.notes, *notes_on_films))
-
-
-def _add_proposed_photos(
-    ply: GaussianFile, files: SceneFiles, camera_file: CameraFile, proposal: Proposal, hints: ReadHints
-) -> Loaded | SceneError:
-    """Combine Gaussians and cameras with all proposed photos, or only with photos of the most frequent aspect ratio.
-
-    If even photos of one aspect ratio cannot be used, all photos are left out; see :func:`_leave_out_photos`.
-    """
-    make_scene = partial(_make_scene_with_views, ply, files, hints)
-    load = _assign_photos(make_scene, camera_file, proposal)
-    if isinstance(load, Loaded):
-        return load
-    if (one_shape := select_one_shape(camera_file, proposal)) is not None:
-        remaining_cameras, remaining_photos, doubts = one_shape
-        remaining_load = _assign_photos(make_scene, remaining_cameras, remaining_photos)
-        if isinstance(remaining_load, Loaded):
-            return replace(remaining_load, notes=(*remaining_load.notes, *doubts))
-    return _leave_out_photos(ply, files, camera_file, proposal, hints, load)
-
-
-def _assign_photos(make_scene: MakeScene, camera_file: CameraFile, proposal: Proposal) -> Loaded | SceneError:
-    """Make a scene with the photos that names propose, or with other photos that show its views.
-
-    1. If the photos have another shape than the cameras, parts of the photos are used if they show the views.
-    2. The scene is read with the proposed photos, or if these photos cannot be used, without photos.
-    3. The views of this scene decide which photo belongs to a view. Parts of photos are used if the parts fit better.
-    4. If the views show photos other than the proposed ones, the scene is read again.
-
-    Notes name photos that cannot be read, and views without a photo. Returns an error if no photo shows a view.
-    """
-    has_no_names = is_without_names(camera_file)
-    shapes_differ = not has_no_names and has_other_shape(proposal, camera_file)
-    make_without_photos = partial(make_scene, replace(camera_file, lenses=()), ScenePhotos())
-    # 1. Parts of photos of another shape
-    if shapes_differ:
-        bare = _read_or_error(make_without_photos)
-        if isinstance(bare, Loaded) and (parts := choose_part(bare.scene, proposal, camera_file)) is not None:
-            return _assign_photos(make_scene, camera_file, parts)
-    # 2. The base: the scene with the proposed photos, or without photos
-    proposed: Loaded | SceneError | None = None  # None if no photos are proposed
-    if not has_no_names and any(proposal.choice):
-        proposed, proposal = _make_with_proposed_photos(make_scene, camera_file, proposal)
-    base = proposed if isinstance(proposed, Loaded) else _read_or_error(make_without_photos)
-    if isinstance(base, SceneError):
-        return proposed or base
-    # 3. The photo of each view, whole or in part
-    photos = assign_to_views(base.scene, proposal, camera_file, read=base is proposed)
-    proposal, chosen = photos.proposal, photos.chosen
-    may_be_parts = photos.may_be_parts and proposal.fit == WHOLE_FIT and not shapes_differ
-    if may_be_parts and (parts := choose_part(base.scene, proposal, camera_file, photos.fit)) is not None:
-        return _assign_photos(make_scene, camera_file, parts)
-    if not any(chosen) or (shapes_differ and not photos.explain_most):
-        # an error of photos of another shape says nothing, unless lenses may have changed the shape
-        if isinstance(proposed, SceneError) and (not shapes_differ or any(camera_file.lenses)):
-            return proposed
-        return explain_mismatch(proposal, camera_file)
-    # 4. The scene with the photos of its views, unless the same photos were proposed
-    load: Loaded | SceneError = base
-    if base is not proposed or chosen != proposal.choice:
-        load = _make_with_photos(make_scene, name_by_photos(camera_file, photos), proposal, chosen)
-    if isinstance(load, SceneError):
-        return load
-    described = describe_assignment(photos, camera_file, are_pixels=base.scene.has_own_pixels)
-    return replace(load, notes=(*proposal.notes, *load.notes, *described), photos_explain=photos.explain_most)
-
-
-def _make_with_proposed_photos(
-    make_scene: MakeScene, camera_file: CameraFile, proposal: Proposal
-) -> tuple[Loaded | SceneError, Proposal]:
-    """Make a scene with all proposed photos, or with those that are not broken; also return the proposal used."""
-    load = _make_with_photos(make_scene, camera_file, proposal, proposal.choice)
-    unbroken = proposal.without_broken() if isinstance(load, SceneError) else None
-    if unbroken is None:
-        return load, proposal
-    return _make_with_photos(make_scene, camera_file, unbroken, unbroken.choice), unbroken
-
-
-def _make_with_photos(
-    make_scene: MakeScene, camera_file: CameraFile, proposal: Proposal, chosen: Sequence[Assignment | None]
-) -> Loaded | SceneError:
-    """Make a scene with the chosen photo of each camera."""
-    return _read_or_error(lambda: make_scene(camera_file, read_photos(proposal, chosen, camera_file)))
-
-
-def _leave_out_photos(
-    ply: GaussianFile,
-    files: SceneFiles,
-    camera_file: CameraFile,
-    proposal: Proposal,
-    hints: ReadHints,
-    cause: SceneError,
-) -> Loaded | SceneError:
-    """Combine Gaussians and cameras without photos, with a note; return ``cause`` if photos must not be left out.
-
-    ``cause`` says why photos and cameras do not fit each other. Photos that the caller named are never left out. Other
-    photos are left out if it is certain that the cameras belong to the scene: if rows are pixels of the cameras, if the
-    cause is a photo, or if the photos were found by the cameras' names. Cameras that merely see the Gaussians may still
-    belong to another scene.
-    """
-    are_named = "images" in files.named
-    if are_named and "cameras" not in files.named and cause.path == camera_file.path:
-        return explain_mismatch(proposal, camera_file)  # it blames the named photos, not the cameras that were found
-    if are_named or _is_fault_of_named(files, cause):
-        return cause
-    bare = _read_or_error(partial(_make_scene_with_views, ply, files, hints, camera_file, ScenePhotos()))
-    photo_is_cause = Path(cause.path).suffix.lower() in IMAGE_SUFFIXES or cause.path == str(proposal.folder)
-    if isinstance(bare, SceneError) or not (bare.scene.has_own_pixels or photo_is_cause or proposal.by_names):
-        return cause
-    return _note_left_out(bare, replace(files, images=proposal.folder), [f"the photos in {proposal.folder}"], cause)
-
-
-def _is_fault_of_named(files: SceneFiles, cause: SceneError) -> bool:
-    """Return whether an error is about a picture in a folder that the caller named, or about a mask of a camera."""
-    folders = (getattr(files, name) for name in ("images", "masks", "protect") if name in files.named)
-    return isinstance(cause, CameraMaskError) or any(
-        folder is not None and Path(cause.path).is_relative_to(folder) for folder in folders
-    )
-
-
 def _make_scene_with_views(
     ply: GaussianFile, files: SceneFiles, hints: ReadHints, camera_file: CameraFile, photos: ScenePhotos
 ) -> Loaded:
     """Combine Gaussians, cameras and photos. Raises SceneError if the cameras or the photos cannot be used."""
     order = _choose_row_order(ply, camera_file, hints)
     pinholes, pictures, notes = as_pinholes(camera_file, photos.pictures)
-    pinholes = at_own_size(pinholes, photo_size(pictures))
     limited, size_notes = limit_photo_size(pictures, len(ply.gaussians), hints.max_side, unaligned=order == "none")
     if files.is_state and files.cameras == files.ply:  # the cameras of a state fit its Gaussians, so none are aligned
         problem = "expected one Gaussian per pixel, found the Gaussians of a state"
@@ -454,28 +392,47 @@ def _make_scene_with_views(
     else:
         frames = partial(read_dataparser, files.ply, files.cameras)
         result = align(ply, pinholes, limited, order=order, scale=hints.scene_scale, frames=frames)
+    photos = photos.without_files(photos.damaged)  # now that all photos were decoded
     notes += [*size_notes, *result.notes]
     if result.pixel_ids is None:
         _check_hints(ply, hints)
         cameras, images, size_notes = limit_view_size(result.cameras, result.images, hints.max_side)
         result = replace(result, cameras=cameras, images=images)
         notes += size_notes
-    size = photo_size(limited)
+    source = PhotoSource(camera_file, photos, photo_size(limited), result.transform)
+    return _make_loaded(ply, files, hints, result, notes, source)
+
+
+def _add_larger_and_masks(load: Loaded) -> Loaded:
+    """Add larger photos and masks to a scene whose cameras and photos are decided.
+
+    Masks that were found, but cannot be used, are left out with a note. Raises SceneError for masks that the caller
+    named, and for masks that the camera file lists if they are photos.
+    """
+    files, source, scene, notes = load.files, load.source, load.scene, list[str]()
+    if source is None:
+        return load
     mask_options = [name for name in ("masks", "protect") if getattr(files, name) is not None]
-    if mask_options and not size:
+    if mask_options and not source.size:
         text = f"the pictures of --{' and --'.join(mask_options)} are not used, since there are no photos"
         notes.append(Doubt(text) if files.named.intersection(mask_options) else text)
-    views = camera_file, photos, size, result.transform, result.cameras  # arguments of find_larger_and_masks
-    larger_and_masks = _read_or_error(lambda: find_larger_and_masks(files, *views))
-    if isinstance(larger_and_masks, SceneError):
-        error = larger_and_masks
-        if "masks" in files.named or Path(error.path) in photos.paths or _is_fault_of_named(files, error):
-            raise error
+    try:
+        large, masks, mask_notes = find_larger_and_masks(files, source, scene.cameras)
+    except SceneError as error:
+        is_protecting = files.protect is not None and Path(error.path).is_relative_to(files.protect)
+        is_listed = isinstance(error, CameraMaskError) or Path(error.path) in source.photos.paths
+        if "masks" in files.named or is_protecting or is_listed:
+            raise
         remedy = error.remedy or f"pass --masks FOLDER, or --masks {NONE}"
         notes.append(Doubt(f"masks are left out: {error.path}: {error.problem}; {remedy}"))
-        larger_and_masks = find_larger_and_masks(replace(files, masks=None, named=files.named | {"masks"}), *views)
-    large, masks, mask_notes = larger_and_masks
-    return _make_loaded(ply, files, hints, result, [*notes, *mask_notes], large, masks, photos.absent)
+        without_masks = replace(files, masks=None, named=files.named | {"masks"})
+        large, masks, mask_notes = find_larger_and_masks(without_masks, source, scene.cameras)
+    masks, check_notes = check_masks(masks, files, scene.pixels)
+    counts = masks.counts
+    if scene.masks is not None:  # some views have no photo, and none of their pixels count
+        counts = scene.masks if counts is None else counts & scene.masks
+    scene = replace(scene, large_photos=large, masks=counts, importance=masks.importance)
+    return replace(load, scene=scene, source=None, notes=(*load.notes, *notes, *mask_notes, *check_notes))
 
 
 def _choose_row_order(ply: GaussianFile, camera_file: CameraFile, hints: ReadHints) -> str:
@@ -515,49 +472,48 @@ def _make_loaded(
     hints: ReadHints,
     result: AlignmentResult,
     notes: Sequence[str],
-    large: LargePhotos | None = None,
-    masks: Masks = NO_MASKS,
-    absent: Sequence[int] = (),
+    source: PhotoSource | None = None,
 ) -> Loaded:
     """Make a scene of the visible Gaussians and all views, with all facts about how it was read.
 
-    ``result`` has the cameras, the photos, and the pixels of the rows. ``large`` has the larger photos of the views,
-    and ``masks`` the masks of the photos. ``absent`` lists the cameras without a photo.
+    ``result`` has the cameras, the photos, and the pixels of the rows. ``source`` has the photos as stored; the scene
+    has no larger photos and no masks yet, see :func:`_add_larger_and_masks`.
     """
+    absent = [] if source is None else source.photos.absent
     camera_file, recovery = result.camera_file, result.recovery
     gaussians, pixels = take_gaussians(ply, result)
     num_faint = int(ply.valid.sum()) - len(gaussians)
     faint = count_words(num_faint, "Gaussian", "fainter than 1/255, which nothing draws, set aside")
-    masks, mask_notes = check_masks(masks, files, pixels)
     photos = result.images if len(result.images) else None
     names = () if camera_file is None else camera_file.names
-    scene = Scene(gaussians, result.cameras, photos, pixels, names, large, masks.counts, masks.importance)
+    scene = Scene(gaussians, result.cameras, photos, pixels, names)
     last_rows = () if pixels is None else pixels.fronts.max((1, 2))  # -1 for a view without rows
     empty_views = [scene.names[view] for view, row in enumerate(last_rows) if row < 0 and view not in absent]
     views_have = f"{len(empty_views)} of {len(scene)} views {'has' if len(empty_views) == 1 else 'have'}"
     doubts = [Doubt(f"{views_have} no Gaussians: {list_some(empty_views)}")] if empty_views else []
-    scene = read_rotations(scene, hints.quats)
+    if hints.quats != "wxyz":
+        scene = replace(scene, gaussians=replace(scene.gaussians, quats=np.roll(scene.gaussians.quats, 1, axis=1)))
     if recovery is not None and result.confirmed_viewmats is not None:
         scene = move_views(scene, result.confirmed_viewmats)
-        result = replace(result, cameras=replace(result.cameras, viewmats=result.confirmed_viewmats))
     alignment = None if recovery is None else check_pixels(scene)
     if alignment is not None and alignment.share_near < 1 - MAX_STRAY:
         share = f"{100 * (1 - alignment.share_near):.0f} % of the Gaussians lie far from their own pixels"
         doubts.append(Doubt(f"{share}, as rows of a damaged file do; copy or export it again"))
-    source = "" if camera_file is None else camera_file.source
+    format_name = "" if camera_file is None else camera_file.source
     order = "none" if recovery is None else recovery.layout.order
     return Loaded(
         scene=without_photo(scene, absent) if absent else scene,
         info=ply.info,
         files=files,
         cameras=camera_file,
-        exporters=choose_exporters(hints.exporter, ply.info, order, source),
-        notes=(*files.notes, *file_notes(ply.info), *doubts, *notes, *([faint] if num_faint else []), *mask_notes),
+        exporters=choose_exporters(hints.exporter, ply.info, order, format_name),
+        notes=(*files.notes, *file_notes(ply.info), *doubts, *notes, *([faint] if num_faint else [])),
         alignment=alignment,
         recovery=recovery,
         problem=result.problem,
         moves=result.moves,
         own_views=result.own_views,
+        source=source,
     )
 
 
@@ -569,26 +525,25 @@ def move_cameras_to_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHi
     SceneError, too.
     """
     for with_photos in dict.fromkeys((True, photos)):  # photos help to find the frame even if they are not needed
-        load = _choose_cameras(ply, files, hints, photos=with_photos)
-        if isinstance(load, Loaded):
-            return load
-    camera_file = _read_or_error(partial(read_scene_cameras, ply, files))
-    if isinstance(camera_file, CameraFile):
-        kept = _read_or_error(partial(_keep_stored_cameras, ply, files, camera_file, hints, photos=photos))
-        if isinstance(kept, Loaded):
+        with suppress(SceneError):
+            return align_scene(ply, files, hints=hints, photos=with_photos, keeps_cameras=True)
+    with suppress(SceneError):
+        kept = _keep_stored_cameras(ply, files, hints, photos=photos)
+        if kept is not None:
             return kept
     return align_scene(ply, files, hints=hints, photos=photos)  # this leaves out files that were not named
 
 
-def _keep_stored_cameras(
-    ply: GaussianFile, files: SceneFiles, camera_file: CameraFile, hints: ReadHints, *, photos: bool
-) -> Loaded | None:
+def _keep_stored_cameras(ply: GaussianFile, files: SceneFiles, hints: ReadHints, *, photos: bool) -> Loaded | None:
     """Return the scene with the cameras as stored in their file, and a doubt that they do not fit.
 
-    Returns None for cameras that the caller did not name and that do not see the Gaussians.
+    Returns None without cameras, and for cameras that the caller did not name and that do not see the Gaussians.
     """
     from gsmerge.cameras import check_cameras  # few scenes need it
 
+    camera_file = read_scene_cameras(ply, files)
+    if camera_file is None:
+        return None
     pictures = stored_photos(files, camera_file) if photos else ()
     cameras = to_cameras(camera_file, photo_size(pictures))
     if "cameras" not in files.named and not check_cameras(ply.gaussians, ply.valid, cameras, NO_IMAGES).ok:

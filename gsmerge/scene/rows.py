@@ -9,13 +9,12 @@ import numpy as np
 
 from gsmerge.cameras import AlignmentResult
 from gsmerge.geometry.transforms import camera_depths, rgb_to_sh0, sh0_to_rgb
-from gsmerge.io.formats.color_units import RGB_NOTE, ColorUnits
+from gsmerge.io.formats.color_units import RGB_NOTE
 from gsmerge.io.formats.read import GaussianFile
 from gsmerge.photos.scene_photos import has_nearer_colors
 from gsmerge.raster.photos import LEAST_OPACITY
 from gsmerge.scene.loaded import Loaded
-from gsmerge.settings.reading import QuatChoice
-from gsmerge.types import Gaussians, Pixels, Scene
+from gsmerge.types import Gaussians, Pixels
 
 _BLOCK = 1 << 20  # numbers that are compared at once
 
@@ -65,35 +64,18 @@ def _counts_up(ids: np.ndarray) -> bool:
     return all(np.array_equal(block, np.arange(first, first + len(block), dtype=ids.dtype)) for first, block in blocks)
 
 
-def _read_as_harmonics(scene: Scene, units: ColorUnits) -> Scene:
-    """Return a scene with colours read as harmonics, from a scene whose colours were read as RGB in ``units``."""
-    stored = units.black + (units.white - units.black) * sh0_to_rgb(scene.gaussians.sh0)
-    return replace(scene, gaussians=replace(scene.gaussians, sh0=stored.astype(np.float32)))
-
-
-def _read_as_rgb(scene: Scene, units: ColorUnits) -> Scene:
-    """Return a scene with colours read as RGB in ``units``, from a scene whose colours were read as harmonics."""
-    sh0 = rgb_to_sh0(units.rgb(scene.gaussians.sh0))
-    return replace(scene, gaussians=replace(scene.gaussians, sh0=sh0.astype(np.float32)))
-
-
 def confirm_colors(load: Loaded) -> Loaded:
     """Read colours as RGB instead of harmonics, or vice versa, if the file allows both and the photos fit better."""
     old_info, units = load.info, load.info.open_units
     if units is None or load.scene.images is None:
         return load
     was_rgb = old_info.color_units is not None  # the colours were read as RGB, and harmonics are tried here
-    other = (_read_as_harmonics if was_rgb else _read_as_rgb)(load.scene, units)
+    sh0 = load.scene.gaussians.sh0
+    sh0 = units.black + (units.white - units.black) * sh0_to_rgb(sh0) if was_rgb else rgb_to_sh0(units.rgb(sh0))
+    other = replace(load.scene, gaussians=replace(load.scene.gaussians, sh0=sh0.astype(np.float32)))
     if not has_nearer_colors(other, load.scene):
         return load
     new_notes = [] if was_rgb else [RGB_NOTE.format(units.name, "photos show it")]
     notes = (*new_notes, *(text for text in load.notes if text != old_info.color_note))
     info = replace(old_info, color_units=None if was_rgb else units, color_note="".join(new_notes))
     return replace(load, scene=other, info=info, notes=notes)
-
-
-def read_rotations(scene: Scene, quats: QuatChoice) -> Scene:
-    """Return a scene with quaternions read in the order ``quats``, from a scene whose quaternions were read as wxyz."""
-    if quats == "wxyz":
-        return scene
-    return replace(scene, gaussians=replace(scene.gaussians, quats=np.roll(scene.gaussians.quats, 1, axis=1)))

@@ -51,34 +51,32 @@ def read_scene_cameras(ply: GaussianFile, files: SceneFiles) -> CameraFile | Non
     return estimate_cameras(files.ply, ply.gaussians.means, ply.valid)
 
 
+@dataclass(frozen=True, eq=False)
+class PhotoSource:
+    """The photos of a scene's views as they are stored, and how the views' pictures follow from them."""
+
+    camera_file: CameraFile  # the cameras as stored, with lenses
+    photos: ScenePhotos  # the photos of these cameras
+    size: Size | None  # size of the undistorted photos; None without photos
+    transform: PhotoTransform | None  # from undistorted photos to the pixels of the rows; None: they are not changed
+
+
 def find_larger_and_masks(
-    files: SceneFiles,
-    camera_file: CameraFile,
-    photos: ScenePhotos,
-    size: Size | None,
-    transform: PhotoTransform | None,
-    cameras: Cameras,
+    files: SceneFiles, source: PhotoSource, cameras: Cameras
 ) -> tuple[LargePhotos | None, Masks, list[str]]:
     """Find the photos at the size of their files, if this size is larger than the scene's, and the masks of photos.
 
     A larger photo is read from its file when it is used. Photos inside other files stay in memory. Masks come from
     files and from the photos' transparency.
 
-    Args:
-        files: The files of the scene.
-        camera_file: The cameras as stored, with lenses.
-        photos: The photos of these cameras.
-        size: Size of the undistorted photos; None without photos.
-        transform: How photos were resized and cropped to the pixels of the rows; None if photos were not changed.
-        cameras: The scene's cameras, in the order of the camera file.
-
-    Returns:
-        The larger photos (None if there are none), the masks, and notes.
+    ``files`` are those of the scene, and ``cameras`` the scene's cameras. Returns the larger photos (None if there are
+    none), the masks, and notes.
     """
+    photos, camera_file = source.photos, source.camera_file
     stored = photos.file_size or photo_size(photos.pictures)
-    if stored is None or size is None:
+    if stored is None or source.size is None:
         return None, NO_MASKS, []
-    window = _file_window(stored, size, transform, cameras)
+    window = _file_window(stored, source.size, source.transform, cameras)
     lenses = camera_file.lenses if photos.paths else ()
     Ks = to_cameras(replace(camera_file, lenses=()), stored).Ks if lenses else None
 
@@ -92,7 +90,7 @@ def find_larger_and_masks(
         """Return the larger photo of a view."""
         if not photos.paths:
             return cut(view, photos.pictures[view])
-        return cut(view, decode_photos([photos.paths[view]], [photos.turns[view]], stored, photos.part)[0])
+        return cut(view, decode_photos([photos.paths[view]], [photos.turns[view]], stored, photos.fit.part)[0])
 
     large = None
     if window.is_larger:
@@ -114,7 +112,7 @@ class _Window:
 def _file_window(stored: Size, size: Size, transform: PhotoTransform | None, cameras: Cameras) -> _Window:
     """Find the part of a photo's file that the view shows, for files of the size ``stored``.
 
-    ``size``, ``transform`` and ``cameras`` are as in :func:`find_larger_and_masks`.
+    ``size`` and ``transform`` are as in :class:`PhotoSource`.
     """
     # all arrays hold x and y
     to_grid = transform or resize_to(size, size)

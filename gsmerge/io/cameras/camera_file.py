@@ -26,8 +26,6 @@ FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # turns OpenGL's camera axes (y up, z ba
 
 # A principal point is in the middle if twice its coordinates differ by at most these pixels from the image's size
 CENTRED_PX = 1e-3
-PATCH_SIDE = 14  # pixels; sides of vision transformers' inputs are multiples of this
-_WHOLE_PX = 1e-3  # a side counts as whole if it differs from a whole number by less than these pixels
 MAX_NORMALISED_FOCAL = 10.0  # longest focal length in sides of the image; a longer focal length is in pixels
 
 # Orders of the Gaussians' rows that a camera file may state
@@ -303,26 +301,6 @@ def _stored_sizes(camera_file: CameraFile) -> list[tuple[int, int]]:
 def sizes_of(camera_file: CameraFile) -> list[tuple[int, int]]:
     """List the different (width, height) of a file's cameras, without unknown sizes."""
     return [(w, h) for w, h in _stored_sizes(camera_file) if min(w, h) > 0 and (w, h) != (1, 1)]
-
-
-def at_own_size(camera_file: CameraFile, size: tuple[int, int] | None) -> CameraFile:
-    """Set the size of cameras without a size to twice their principal point, if the photos have another size.
-
-    ``size`` is (width, height) of the photos. Cameras stay unchanged if twice the principal point differs from the
-    photos in aspect ratio, or is nearly the photos' size. Sides that are not whole numbers are rounded to multiples of
-    ``PATCH_SIDE``, since sides of networks' inputs are such multiples.
-    """
-    if size is None or _stored_sizes(camera_file) != [(0, 0)]:
-        return camera_file
-    sides = 2 * np.median(camera_file.Ks[:, :2, 2], 0)
-    ratios = sides / size
-    min_difference = 0.1  # sizes are different if their sides differ by at least this share
-    has_photo_shape = float(ratios.max()) < (1 + min_difference) * float(ratios.min())
-    if not has_photo_shape or (sides < MAX_NORMALISED_FOCAL).any() or not (np.abs(ratios - 1) > min_difference).all():
-        return camera_file
-    step = 1 if (np.abs(sides - sides.round()) < _WHOLE_PX).all() else PATCH_SIDE
-    widths, heights = (np.full(len(camera_file), step * round(side / step)) for side in sides.tolist())
-    return replace(camera_file, widths=widths, heights=heights)
 
 
 @check_arguments
