@@ -10,6 +10,10 @@ import errno
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from os import PathLike
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 
 class GsmergeError(Exception):
@@ -66,8 +70,25 @@ class DoubtWarning(UserWarning):
     """
 
 
-class Doubt(str):
-    """A note for the user that the result may be poor or wrong. Other notes are plain strings.
+class Note(str):
+    """A note for the user, and what it is ``about``: a topic such as "columns", and the ``names`` of these columns.
+
+    Code chooses among notes by what they are about, and never by their words. Notes among which no code chooses are
+    plain strings.
+    """
+
+    about: str
+    names: tuple[str, ...]
+
+    def __new__(cls, text: str, about: str = "", names: Iterable[str] = ()) -> Self:
+        """Return the text with its topic and names."""
+        note = super().__new__(cls, text)
+        note.about, note.names = about, tuple(names)
+        return note
+
+
+class Doubt(Note):
+    """A note for the user that the result may be poor or wrong.
 
     Commands show a doubt as a warning, and fail with ``--strict``; Python gives a :class:`gsmerge.DoubtWarning`.
     """
@@ -78,9 +99,18 @@ def list_doubts(notes: Iterable[str]) -> list[str]:
     return [note for note in notes if isinstance(note, Doubt)]
 
 
+def split_notes(notes: Iterable[str], about: str) -> tuple[list[Note], list[str]]:
+    """Split notes into those about a topic, and all others."""
+    chosen = [note for note in notes if isinstance(note, Note) and note.about == about]
+    return chosen, [note for note in notes if not (isinstance(note, Note) and note.about == about)]
+
+
 def name_notes(name: object, notes: Iterable[str]) -> list[str]:
     """Put a name before each note, such as that of the file that the note is about; doubts stay doubts."""
-    return [type(note)(f"{name}: {note}") for note in notes]
+    return [
+        type(note)(f"{name}: {note}", note.about, note.names) if isinstance(note, Note) else f"{name}: {note}"
+        for note in notes
+    ]
 
 
 class TargetError(GsmergeError):

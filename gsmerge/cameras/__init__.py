@@ -17,7 +17,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from gsmerge.cameras.layouts import ESTIMATED, NO_CAMERAS_USED, TRIMS, Layout
+from gsmerge.cameras.layouts import ESTIMATED, TRIMS, Layout
 from gsmerge.cameras.rows_first import AlignmentResult, Recovery, align
 from gsmerge.cameras.score import Alignment, check_pairs, check_pixels, sample_pixels
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 ESTIMATED = "estimated from the grid"  # the `source` of cameras that no file gives
-NO_CAMERAS_USED = "no cameras are used"  # first words of the note that cameras are not used
 TRIMS = (8, 4, 2)  # pixels that DepthSplat, ZPressor and ReSplat cut off at every border
 
 

@@ -22,7 +22,7 @@ from gsmerge.cameras.dropped_rows import follow_rows
 from gsmerge.cameras.estimate import estimate_cameras
 from gsmerge.cameras.frames import exporter_frames, fit_frame, scale_by, solve_poses
 from gsmerge.cameras.grids import Grid, list_grids, with_poses, with_sizes
-from gsmerge.cameras.layouts import ESTIMATED, NO_CAMERAS_USED, Layout
+from gsmerge.cameras.layouts import ESTIMATED, Layout
 from gsmerge.cameras.poses import move_cameras, other_conventions
 from gsmerge.cameras.score import (
     AS_NEAR,
@@ -34,7 +34,7 @@ from gsmerge.cameras.score import (
     max_correctable_px,
     pixel_errors,
 )
-from gsmerge.errors import SceneError
+from gsmerge.errors import Note, SceneError
 from gsmerge.geometry.transforms import IDENTITY, Similarity, median
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.formats.read import GaussianFile
@@ -335,7 +335,8 @@ def _make_alignment(source: RowSource, recovery: Recovery) -> AlignmentResult:
         subject = (
             "poses, and focal lengths that differ between the views," if focals_differ else "poses and focal length"
         )
-        notes.append(f"{NO_CAMERAS_USED}: {subject} are estimated from the Gaussians' own grid")
+        text = f"no cameras are used: {subject} are estimated from the Gaussians' own grid"
+        notes.append(Note(text, "estimated cameras"))
     return AlignmentResult(
         pixel_ids=recovery.layout.pixel_ids(),
         cameras=grid.placed,

@@ -147,8 +147,8 @@ def _run_jobs(args: opt.Args, jobs: Sequence[Job], options: BatchOptions, totals
             failure, num_skipped = record["error"] or "", totals.counts[SKIPPED]
             # skipped scenes take no time, so the time left is estimated without them
             share = 1.0 if num_ended == len(jobs) else (num_ended - num_skipped) / (len(jobs) - num_skipped)
-            report = record["report"] or {"notes": record["doubts"]}  # a result that was done before has no report
-            notes = [Doubt(note) if note in record["doubts"] else note for note in report["notes"]]
+            report = record["report"]  # None for a failure, and for a result that was done before
+            notes = [Doubt(text) for text in record["doubts"]] if report is None else report["notes"]
             progress(RunEnd(record["scene"], record["status"], num_ended, failure, totals.counts[FAILED], share, notes))
 
 

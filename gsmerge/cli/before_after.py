@@ -79,8 +79,8 @@ def read_before_after(args: Args, files: SceneFiles) -> BeforeAfter:
         require_views(load)
     scene, held_out, target_notes = held_out_views(load, args.targets, vars(args).get("target_images"), views)
     with record_run() as record:
-        scene = add_views(scene, shown=True)
-    notes = [PLACED_VIEWS if note == NO_VIEWS and not args.after else note for note in record.notes]
+        scene = add_views(scene, shown=True, placed=NO_VIEWS if args.after else PLACED_VIEWS)
+    notes = [*record.notes]
     plys = {name: read_gaussians(path) for name, path in zip(file_names(args.after), args.after, strict=True)}
     if plys and all(ply.info.count > load.info.count for ply in plys.values()):
         notes.append(

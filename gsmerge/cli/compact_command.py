@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import print_document, say, say_notes, separate_stdout, stage_progress, terminal_columns
 from gsmerge.cli.paths import check_outputs, default_output, input_files, output_file
-from gsmerge.errors import TargetError, UsageError
+from gsmerge.errors import Doubt, TargetError, UsageError, split_notes
 from gsmerge.settings.compact import CHECKPOINTS, CompactOptions
 from gsmerge.settings.files import FileOptions
 from gsmerge.settings.reading import NONE
@@ -164,8 +164,8 @@ def _print_result(args: opt.Args, document: Mapping[str, Any], out: Path, *, sho
     """Print the report of a run and, unless a page will show the result (``shown``), how to view it."""
     from gsmerge.compaction.report import result_table
 
-    judged = document["doubts"] if args.strict else [document["worse"]]  # :func:`_judge_result` prints these
-    say_notes([note for note in document["notes"] if note not in judged], quiet=args.silent)
+    notes = split_notes(document["notes"], "worse")[1]  # :func:`_judge_result` prints the others
+    say_notes([note for note in notes if not (args.strict and isinstance(note, Doubt))], quiet=args.silent)
     columns = terminal_columns(sys.stdout)
     next_step = None if columns is None or shown else _view_command(args.scenes[0], out)
     lines = result_table(document, next_step, columns=columns)

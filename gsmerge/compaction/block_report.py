@@ -50,7 +50,7 @@ def join_reports(
     worse = None if pictures is None else describe_loss("the result", before, after, pictures)
     return CompactReport(
         num_input=scene.num_gaussians, num_output=len(gaussians), seconds=dict(run.seconds), psnr_before=before,
-        psnr_after=after, notes=[*run.notes, *([] if worse is None else [Doubt(worse)])],
+        psnr_after=after, notes=[*run.notes, *([] if worse is None else [Doubt(worse, "worse")])],
         choices=run.choices | {"scored_views": len(scene) if may_be_worse else scored, "scored_all": may_be_worse},
         options=options.to_dict(), peak_memory_bytes=peak_memory(), worse=worse, psnr_reference=reference,
     )  # fmt: skip

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 from gsmerge.compaction.outputs import Outputs
-from gsmerge.errors import SceneError
+from gsmerge.errors import SceneError, split_notes
 from gsmerge.io.formats.arrays import RESULT_COMMENT
-from gsmerge.io.formats.columns import UNUSED, list_names
+from gsmerge.io.formats.columns import list_names
 from gsmerge.io.formats.ply import is_from_gsmerge
 from gsmerge.io.scene_files import SceneFiles, result_cameras
 from gsmerge.measure.documents import file_sha256
@@ -58,8 +58,8 @@ def _compact_notes(loaded: Loaded) -> list[str]:
     gsmerge is a result if its header says so, or if it has at most one Gaussian for every two pixels of its views.
     """
     scene, comments, notes = loaded.scene, loaded.info.comments, list[str]()
-    unused = " ".join(note for note in loaded.info.adapted if note.startswith(UNUSED))  # columns that a note names
-    lost = [name for name in loaded.info.extra_columns if name not in unused]
+    told = {name for note in split_notes(loaded.info.adapted, "columns")[0] for name in note.names}
+    lost = [name for name in loaded.info.extra_columns if name not in told]
     if lost:
         notes.append(f"merged Gaussians do not have the columns {list_names(lost)}; gsmerge convert copies them")
     pixels = len(scene) * scene.cameras.height * scene.cameras.width

@@ -143,7 +143,7 @@ class CompactReport:
 
     def with_worse(self, worse: str) -> CompactReport:
         """Return the report with the doubt ``worse``, which says that the result is worse than its input."""
-        return replace(self, notes=[*self.notes, Doubt(worse)], worse=worse)
+        return replace(self, notes=[*self.notes, Doubt(worse, "worse")], worse=worse)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the report as plain JSON types, by the names of its fields, with ``doubts``."""

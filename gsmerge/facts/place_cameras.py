@@ -56,16 +56,17 @@ NO_VIEWS = (
 )
 
 
-def add_views(scene: Scene, *, shown: bool = False) -> Scene:
+def add_views(scene: Scene, *, shown: bool = False, placed: str = NO_VIEWS) -> Scene:
     """Keep the finite Gaussians, and place cameras in a scene without cameras; notes say what was left out or placed.
 
     The cameras are placed for a fit, or with ``shown`` for people who look at the scene (:func:`place_viewpoints`).
-    Raises ValueError if no Gaussian is finite.
+    ``placed`` is the note about cameras that are not placed at a viewer's place. Raises ValueError if no Gaussian is
+    finite.
     """
     scene = keep_finite(scene)
     if len(scene) == 0:
         inside = place_inside(scene.gaussians)
-        note(NO_VIEWS if inside is None else VIEWER_VIEWS)
+        note(placed if inside is None else VIEWER_VIEWS)
         cameras = inside or (_place_around_and_inside if shown else place_around)(scene.gaussians)
         order = sorted(range(len(cameras)), key=lambda view: (view + 1) % HELD_OUT != 0)  # held-out cameras come first
         scene = _with_cameras(scene.gaussians, cameras if shown else cameras[order])

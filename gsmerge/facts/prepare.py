@@ -152,7 +152,7 @@ def prepare(
         if options.poses != "fixed":
             moved = move_poses(scene, reference.score_views, always=options.poses == "free")
             is_moved, scene = moved is not None, moved or scene
-    if reference.name == PHOTOS and files is not None and _has_changed(files, scene, reference, repeated):
+    if reference.name == PHOTOS and files is not None and _has_changed(files, scene, reference.score_views, repeated):
         reference = replace(reference, photo_files=files)
     agreement = confirm_depths(scene)
     if agreement is not None:
@@ -193,15 +193,18 @@ def choose_pictures(scene: Scene, look: Look, *, placed: bool) -> tuple[Pictured
     return drawn, Reference(RENDERS, shown or scored, placed)
 
 
-def _has_changed(photos: np.ndarray, scene: PicturedScene, reference: Reference, repeated: Sequence[int]) -> bool:
-    """Return whether preparation changed a pixel of the input's ``photos`` that counts in scores."""
+def _has_changed(photos: np.ndarray, scene: PicturedScene, views: Sequence[int], repeated: Sequence[int]) -> bool:
+    """Return whether preparation changed a pixel of the input's ``photos`` that counts in scores of ``views``.
+
+    ``repeated`` has the index in the ``scene`` of each photo's view.
+    """
     if scene.images is photos:
         return False
     counting = np.full(scene.images.shape[:3], True) if scene.masks is None else scene.masks
     return any(
         not np.array_equal(before[counting[view]], scene.images[view][counting[view]])
         for before, view in zip(photos, repeated, strict=True)
-        if view in reference.score_views
+        if view in views
     )
 
 
@@ -277,14 +280,16 @@ def scored_pictures(scene: Scene) -> tuple[Scene, bool]:
     has_pictures = scene.has_own_pixels or scene.images is not None
     if len(scene) == 0 or len(scene.gaussians) == 0 or not has_pictures:
         return scene, False
-    with record_part(silent=True) as record:
+    with record_part(silent=True):
         canonical = canonicalise(scene)[0]
         if scene.images is not None:
-            compared, views = compare_photos(PicturedScene.with_pictures(canonical, scene.images, scene.masks))
+            given = PicturedScene.with_pictures(canonical, scene.images, scene.masks)
+            compared, views = compare_photos(given)
             if views or not scene.has_own_pixels:
                 if canonical.has_own_pixels:
-                    equalise_exposure(compared, views, "auto")
-                return scene, not views or bool(record.choices)
+                    compared = equalise_exposure(compared, views, "auto")
+                left_out = len(views) < len(given.photo_views)
+                return scene, left_out or _has_changed(given.images, compared, views, range(len(given)))
         colored = add_row_colors(replace(canonical, images=None, large_photos=None, masks=None))
     return replace(scene, images=colored.images, masks=colored.masks), False
 

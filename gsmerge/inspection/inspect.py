@@ -53,7 +53,6 @@ _UNKNOWN_KEYS = (
     "camera_format", "rows", "alignment", "alignment_problem", "sight", "compact", "auto", "agreement", "num_unseen",
 )  # None unless the views are known  # fmt: skip
 _CAMERA_ELEMENTS = ("extrinsic", "intrinsic", "image_size")  # elements of a .ply that hold its camera
-_REPEATED = "read as: "  # first words of notes that repeat the line "rows"
 _ENCODINGS = {"logit": "as logits", "raw": "in [0, 1]"}  # words for the encodings of opacities
 
 
@@ -278,9 +277,7 @@ def inspection_lines(scene: Mapping[str, Any]) -> list[str]:
     if auto := scene["auto"]:
         share = f"{100 * auto['share']:.3g} %, {auto['num_gaussians']:,} Gaussians"
         lines += [f"auto       --budget auto takes {share}: {auto['why']}"]
-    repeated = () if scene["alignment_problem"] is None and scene["rows"] is None else _REPEATED
-    notes = [note for note in scene["notes"] if not note.startswith(repeated)]
-    return [line for line in lines if line] + note_lines(notes)
+    return [line for line in lines if line] + note_lines(scene["notes"])
 
 
 def _batch_lines(batches: Sequence[Mapping[str, Any]]) -> list[str]:

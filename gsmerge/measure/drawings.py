@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from gsmerge.errors import SceneError, UsageError, name_notes
-from gsmerge.facts.place_cameras import NO_VIEWS, add_views
+from gsmerge.facts.place_cameras import add_views
 from gsmerge.io import file_notes, read_cameras, read_gaussians, to_cameras
 from gsmerge.io.atomic import atomic_outputs, common_mode
 from gsmerge.io.cameras.camera_file import sizes_of
@@ -313,13 +313,12 @@ def _with_views(load: Loaded, *, inside: bool) -> Loaded:
     """Place views around a scene that has no views, and if ``inside`` also inside the scene."""
     if len(load.scene):
         return load
+    placed = f"no cameras: views are placed {'around and inside' if inside else 'around'} the scene"
     with record_run() as record:
-        scene = add_views(load.scene, shown=True)
+        scene = add_views(load.scene, shown=True, placed=placed)
     scene = scene if inside else subset(scene, range(len(scene) // 2))
     scene = replace(scene, cameras=fill_cameras(scene.cameras, *PLACED_SIZE))
-    placed = f"no cameras: views are placed {'around and inside' if inside else 'around'} the scene"
-    notes = (placed if text == NO_VIEWS else text for text in record.notes)  # NO_VIEWS is about results
-    return replace(load, scene=scene, notes=(*load.notes, *notes))
+    return replace(load, scene=scene, notes=(*load.notes, *record.notes))
 
 
 def find_view(view: str, names: Sequence[str]) -> int:

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from gsmerge.cameras import NO_CAMERAS_USED, AlignmentResult, align, check_pixels
-from gsmerge.errors import Doubt, DoubtWarning, SceneError, name_notes
+from gsmerge.cameras import AlignmentResult, align, check_pixels
+from gsmerge.errors import Doubt, DoubtWarning, Note, SceneError, name_notes, split_notes
 from gsmerge.geometry.transforms import move_views
 from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, to_cameras
 from gsmerge.io.cameras.dataparser import read_dataparser
@@ -262,7 +262,7 @@ def _read_without_cameras(
     missing = describe_missing(load.scene.names, stored, is_right=best is not None)
     if missing is None:
         return best or _note_left_out(load, files, [str(files.cameras)], errors[0])
-    return replace(load, notes=(missing, *(note for note in load.notes if not note.startswith(NO_CAMERAS_USED))))
+    return replace(load, notes=(missing, *split_notes(load.notes, "estimated cameras")[1]))
 
 
 def _read_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints, *, photos: bool) -> Loaded:
@@ -364,18 +364,15 @@ def _note_left_out(load: Loaded, files: SceneFiles, left_out: list[str], cause: 
     ``left_out`` describes the files that are left out. If photos cannot be used without these files, the doubt also
     names the photos, and replaces the notes on photos.
     """
-    photos = f"the photos in {files.images or files.ply.parent}"
-    photo_notes = tuple(text for text in load.notes if text.startswith(f"{photos} are not used"))
-    left_out = [*left_out, *([photos] if photo_notes else [])]
+    photo_notes, notes = split_notes(load.notes, "unused photos")
+    left_out = [*left_out, *([f"the photos in {files.images or files.ply.parent}"] if photo_notes else [])]
     known_paths = map(str, (files.ply, files.ply.parent, files.cameras, files.images))
     damaged_file = "" if cause.path in known_paths else f"{cause.path}: "
     option, value = ("cameras", "FILE") if left_out[0] == str(files.cameras) else ("images", "FOLDER")
     remedy = cause.remedy or f"pass --{option} {value}, or --{option} {NONE}"
     verb = "is" if left_out == [str(files.cameras)] else "are"
     doubt = f"{' and '.join(left_out)} {verb} left out: {damaged_file}{cause.problem}; {remedy}"
-    return replace(
-        load, notes=(Doubt(" ".join(doubt.split())), *(text for text in load.notes if text not in photo_notes))
-    )
+    return replace(load, notes=(Doubt(" ".join(doubt.split())), *notes))
 
 
 def _make_scene_with_views(
@@ -454,7 +451,7 @@ def _make_scene_without_views(ply: GaussianFile, files: SceneFiles, hints: ReadH
             if "cameras" in files.named
             else "there are no cameras, such as a transforms.json or a COLMAP model; name them with --cameras"
         )
-        notes += [f"the photos in {files.images} are not used: {reason}"]
+        notes += [Note(f"the photos in {files.images} are not used: {reason}", "unused photos")]
     problem = "expected one Gaussian per pixel, found no cameras"
     return _make_loaded(ply, files, hints, AlignmentResult(None, NO_CAMERAS, NO_IMAGES, None, problem=problem), notes)
 

@@ -8,6 +8,7 @@ from math import prod
 import numpy as np
 
 from gsmerge.cameras import AlignmentResult
+from gsmerge.errors import Note, split_notes
 from gsmerge.geometry.transforms import camera_depths, rgb_to_sh0, sh0_to_rgb
 from gsmerge.io.formats.color_units import RGB_NOTE
 from gsmerge.io.formats.read import GaussianFile
@@ -75,7 +76,7 @@ def confirm_colors(load: Loaded) -> Loaded:
     other = replace(load.scene, gaussians=replace(load.scene.gaussians, sh0=sh0.astype(np.float32)))
     if not has_nearer_colors(other, load.scene):
         return load
-    new_notes = [] if was_rgb else [RGB_NOTE.format(units.name, "photos show it")]
-    notes = (*new_notes, *(text for text in load.notes if text != old_info.color_note))
-    info = replace(old_info, color_units=None if was_rgb else units, color_note="".join(new_notes))
+    new_note = "" if was_rgb else RGB_NOTE.format(units.name, "photos show it")
+    notes = *([Note(new_note, "colors")] if new_note else []), *split_notes(load.notes, "colors")[1]
+    info = replace(old_info, color_units=None if was_rgb else units, color_note=new_note)
     return replace(load, scene=other, info=info, notes=notes)

@@ -12,7 +12,7 @@ from gsmerge.cameras import check_cameras
 from gsmerge.compaction.compact import compact_prepared
 from gsmerge.compaction.methods import choose_method
 from gsmerge.compaction.placement import pad_harmonics
-from gsmerge.errors import SceneError
+from gsmerge.errors import SceneError, split_notes
 from gsmerge.facts.confirm_depths import CHANCE_ERRORS, NORMAL_SAMPLES
 from gsmerge.facts.prepare import Prepared
 from gsmerge.geometry.transforms import camera_centres, camera_distances
@@ -90,8 +90,7 @@ def extend(
             refuse_other_world(world, extend_options)
             parts = [before.gaussians]
         result = compact_prepared(prepared, make_plan(prepared, options, run=method.run))
-    # Only a final result gets the note that the result is worse than its input
-    notes = [text for text in result.report.notes if text != result.report.worse]
+    notes = split_notes(result.report.notes, "worse")[1]  # only of a final result is it said that it is worse
     notes += [NOT_COMPARED] if before is not None and world == UNKNOWN_WORLD else []
     parts.append(result.gaussians.numpy())
     num_higher = max(part.shN.shape[1] for part in parts)

@@ -70,3 +70,59 @@ def test_prepared_facts_are_few() -> None:
 def test_prepared_facts_hold_no_options() -> None:
     assert not {f.name for f in fields(Prepared)} & {f.name for f in fields(PrepareOptions)}
     assert all("Options" not in str(f.type) for f in fields(Prepared))
+
+
+READS_TEXT = {
+    "startswith",
+    "endswith",
+    "find",
+    "index",
+    "count",
+    "split",
+    "partition",
+    "removeprefix",
+    "match",
+    "search",
+}
+
+
+def note_names(loop: ast.For | ast.comprehension) -> set[str]:
+    """Return the variables of a loop over notes or doubts; empty for another loop."""
+    is_of_notes = re.search(r"\b(notes|doubts|adapted)\W*$", ast.unparse(loop.iter)) is not None
+    return {node.id for node in ast.walk(loop.target) if isinstance(node, ast.Name)} if is_of_notes else set()
+
+
+def reads_of_notes(tree: ast.AST) -> Iterator[str]:
+    """List where code compares a note, or searches in its text."""
+    for loop in (node for node in ast.walk(tree) if isinstance(node, ast.For | ast.ListComp | ast.GeneratorExp)):
+        loops = [loop] if isinstance(loop, ast.For) else loop.generators
+        names = set().union(*map(note_names, loops))
+        for node in ast.walk(loop):
+            is_name = isinstance(node, ast.Compare) and any(
+                isinstance(side, ast.Name) and side.id in names for side in (node.left, *node.comparators)
+            )
+            is_call = (
+                isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in READS_TEXT
+            )
+            if is_name or (is_call and any(isinstance(n, ast.Name) and n.id in names for n in ast.walk(node))):
+                yield ast.unparse(node)
+    for node in ast.walk(tree):
+        is_search = isinstance(node, ast.Compare) and any(isinstance(op, ast.In | ast.NotIn) for op in node.ops)
+        if is_search and re.search(r"\bnotes$", ast.unparse(node.comparators[-1])):
+            yield ast.unparse(node)
+
+
+def test_no_code_reads_the_words_of_notes() -> None:
+    """What a note is about is data of it (:class:`gsmerge.errors.Note`); the record alone drops what it has twice."""
+    found = {path.relative_to(PACKAGE).as_posix(): [*reads_of_notes(ast.parse(text))] for path, text in texts().items()}
+    assert {path: reads for path, reads in found.items() if reads and path != "runtime/record.py"} == {}
+
+
+def test_reading_the_words_of_a_note_is_found() -> None:
+    for code in (
+        "[note for note in load.notes if note.startswith('x')]",
+        "any(text == WORSE for text in report.doubts)",
+        "if 'no photos' in record.notes: pass",
+        "for note in self.notes:\n    if re.search('x', note): pass",
+    ):
+        assert len([*reads_of_notes(ast.parse(code))]) == 1, code

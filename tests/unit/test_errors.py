@@ -3,10 +3,23 @@
 from __future__ import annotations
 
 import pickle
+from collections.abc import Callable
 
 import pytest
 
-from gsmerge.errors import OUT_OF_MEMORY, BatchError, GsmergeError, SceneError, TargetError, UsageError
+from gsmerge.errors import (
+    OUT_OF_MEMORY,
+    BatchError,
+    Doubt,
+    GsmergeError,
+    Note,
+    SceneError,
+    TargetError,
+    UsageError,
+    list_doubts,
+    name_notes,
+    split_notes,
+)
 
 
 @pytest.mark.parametrize(
@@ -27,3 +40,20 @@ def test_advice_for_all_commands_names_no_option() -> None:
 
 def test_views_without_names_are_named_once() -> None:
     assert str(SceneError("a.json", "view view 0: expected numbers")) == "a.json: view 0: expected numbers"
+
+
+NOTES = [Note("not used: r", "columns", ["r"]), Doubt("is worse", "worse"), Doubt("is old"), "plain"]
+
+
+def test_notes_are_chosen_by_what_they_are_about() -> None:
+    assert split_notes(NOTES, "worse") == ([NOTES[1]], [NOTES[0], *NOTES[2:]])
+    assert list_doubts(NOTES) == NOTES[1:3]
+
+
+@pytest.mark.parametrize("change", [lambda notes: pickle.loads(pickle.dumps(notes)), lambda n: name_notes("a.ply", n)])
+def test_notes_of_other_processes_and_files_keep_what_they_are_about(change: Callable[[list[str]], list[str]]) -> None:
+    changed = change(NOTES)
+    assert [type(note) for note in changed] == [Note, Doubt, Doubt, str]
+    assert [(note.about, note.names) for note in changed if isinstance(note, Note)] == [
+        ("columns", ("r",)), ("worse", ()), ("", ()),
+    ]  # fmt: skip

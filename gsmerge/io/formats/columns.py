@@ -9,10 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from gsmerge.errors import SceneError
+from gsmerge.errors import Note, SceneError
 from gsmerge.io.formats import arrays
 
-UNUSED = "not used: "  # start of the note
 _MOMENT = "save one moment as a .ply, with positions, rotations and opacities of that time"
 
 
@@ -109,7 +108,8 @@ def check_columns(path: Path, row_type: np.dtype[np.void], layers: Sequence[str]
     parts = [f"{list_names(names)} ({kind.what}: {kind.effect})" for kind, names in known]
     parts += [f"{list_names(by_kind[None])} (unknown)"] if None in by_kind else []
     parts += [f"{list_names(layers)} (more Gaussians)"] if layers else []
-    return (UNUSED + "; ".join(parts),) if parts else ()
+    unused = [name for kind, names in by_kind.items() if kind is None or kind.what for name in names]
+    return (Note(f"not used: {'; '.join(parts)}", "columns", unused),) if parts else ()
 
 
 def _check_types(path: Path, row_type: np.dtype[np.void]) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from gsmerge.errors import Doubt, SceneError
+from gsmerge.errors import Doubt, Note, SceneError
 from gsmerge.geometry.transforms import lower_median, rgb_to_sh0
 from gsmerge.io.formats import arrays, ply
 from gsmerge.io.formats.arrays import StoredRows
@@ -89,7 +89,7 @@ def file_notes(info: FileInfo) -> tuple[str, ...]:
         (info.num_zero_quats, "Gaussian", "with a zero quaternion, read as the identity"),
     )
     raw = ("opacities lie in [0, 1] and are read as such; if they are logits, use --hint opacity=logit",)
-    color_notes = (info.color_note,) if info.color_note else ()
+    color_notes = (Note(info.color_note, "colors"),) if info.color_note else ()
     raw_notes = raw if info.opacity_encoding == "raw" and info.opacity_guessed else ()
     scale_notes = (Doubt(info.odd_scales),) if info.odd_scales else ()
     count_notes = (count_words(count, noun, rest) for count, noun, rest in counts if count)

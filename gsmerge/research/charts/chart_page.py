@@ -9,7 +9,7 @@ from gsmerge.measure.documents import csv_text
 from gsmerge.pages.page import PICTURES_POLICY, data_uri, render_template
 from gsmerge.research.charts.figures import Chart
 from gsmerge.research.charts.lines import CHART_METRICS, MIN_SCENES, PARTS, Results, size_label
-from gsmerge.research.charts.measure_run import HELD_OUT_NOTE, RunRecord
+from gsmerge.research.charts.measure_run import RunRecord
 
 COSTS = ("Gaussians", "Kept", "Bytes", "Seconds")
 ChartTable = tuple[Sequence[str], Sequence[Sequence[str]]]  # head and rows
@@ -44,8 +44,9 @@ def make_chart_page(
 
 def list_held_out_notes(records: Sequence[RunRecord]) -> list[str]:
     """For each scene without targets, list the photos that were held out of its runs."""
-    notes = (f"{record.scene}: {note}" for record in records for note in record.notes if note.startswith(HELD_OUT_NOTE))
-    return list(dict.fromkeys(notes))
+    why = "without --targets, these photos are hidden from all runs, which are scored on them"
+    names = {record.scene: record.held_out for record in records if record.held_out}
+    return [f"{scene}: {why}: {', '.join(photos)}" for scene, photos in names.items()]
 
 
 def _mean_table(results: Results) -> ChartTable:

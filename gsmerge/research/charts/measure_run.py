@@ -23,7 +23,6 @@ from gsmerge.settings.compact import CompactOptions
 from gsmerge.types import Gaussians, Scene, Views
 
 RUNS = "runs.jsonl"  # in the folder of a grid
-HELD_OUT_NOTE = "without --targets, these photos are hidden from all runs, which are scored on them"
 SCORING = ("score", "input")  # stages of a run that only measure
 
 
@@ -57,6 +56,7 @@ class RunRecord:
     seconds: float = 0.0  # wall time of the merge, without reading, writing and scoring
     scores: Mapping[str, float] = field(default_factory=dict)
     notes: tuple[str, ...] = ()  # notes of the reader and of the run
+    held_out: tuple[str, ...] = ()  # photos that were hidden from the run to score it, as the scene has no targets
     error: str | None = None  # reason of a failure, in one line; None if the run succeeded
 
     @property
@@ -79,7 +79,9 @@ def read_runs(folder: Path) -> list[RunRecord]:
     runs: dict[tuple[str, str], RunRecord] = {}
     for _, line in each_line(folder / RUNS):
         if line is not None and line.keys() == RunRecord.__dataclass_fields__.keys():
-            runs[line["scene"], line["label"]] = RunRecord(**{**line, "notes": tuple(line["notes"])})
+            runs[line["scene"], line["label"]] = RunRecord(
+                **{**line, "notes": tuple(line["notes"]), "held_out": tuple(line["held_out"])}
+            )
     return list(runs.values())
 
 
@@ -103,6 +105,7 @@ def run_setting(source: ChartScene, record: RunRecord, options: CompactOptions, 
         seconds=seconds,
         scores=mean_scores(scene, None if record.method == INPUT else gaussians, held_out, measured),
         notes=notes,
+        held_out=() if held_out is None or source.targets is not None else held_out.names,
     )
 
 
@@ -114,10 +117,8 @@ def load_source(source: ChartScene) -> tuple[Scene, HeldOutViews | None, tuple[s
     """
     load = load_files(find_scene_files(source.path))
     if source.targets is not None:
-        return load.scene, read_held_out(load, source.targets), tuple(load.notes)
-    scene, held_out = hold_out(load.scene)
-    held_out_notes = () if held_out is None else (f"{HELD_OUT_NOTE}: {', '.join(held_out.names)}",)
-    return scene, held_out, (*load.notes, *held_out_notes)
+        return load.scene, read_held_out(load, source.targets), load.notes
+    return *hold_out(load.scene), load.notes
 
 
 def hold_out(scene: Scene) -> tuple[Scene, HeldOutViews | None]:
