@@ -18,7 +18,7 @@ import typer
 
 from gsmerge.cli import INTERRUPTED, stop_at_once
 from gsmerge.cli.console import JsonLines, json_progress, plain_warnings, say
-from gsmerge.cli.usage import LAB, LOOK, PROGRAM, Command, Group, UsageErrors, usage_message
+from gsmerge.cli.usage import LAB, PROGRAM, Command, Group, UsageErrors, usage_message
 from gsmerge.errors import (
     DAMAGED_OPENCV,
     NO_TORCH,
@@ -56,20 +56,17 @@ def make_app(only: str | None = None) -> typer.Typer:
         name=PROGRAM, cls=Group, pretty_exceptions_enable=False,
         context_settings={"help_option_names": ["-h", "--help"]},
     )  # fmt: skip
-    app.callback(invoke_without_command=True)(root)
+    app.callback()(root)
     for panel, names in COMMAND_GROUPS.items():
         for name in names:
             if only in (None, name):
                 function = getattr(import_module(f"gsmerge.cli.{name}_command"), name)
                 app.command(cls=Command, rich_help_panel=panel)(function)
-    if only == LOOK:
-        app.command(LOOK, cls=Command)(import_module("gsmerge.cli.compact_command").look)
-    if only in (*OWN_COMMANDS, LOOK):
+    if only in OWN_COMMANDS:
         return app
     lab = typer.Typer(
         cls=Group, help="Research: charts of many runs, synthetic scenes, bad conditions, training of networks."
     )
-    lab.callback(invoke_without_command=True)(print_help)
     for name, entry in find_plugins(PLUGINS).items():
         in_lab = _is_research(entry)
         if only in (None, LAB if in_lab else name) and name not in OWN_COMMANDS:
@@ -81,7 +78,7 @@ def make_app(only: str | None = None) -> typer.Typer:
             if in_lab:
                 lab.command(name, cls=Command)(function)
             else:
-                app.command(name, cls=Command, rich_help_panel=PLUGIN_PANEL)(function)
+                app.command(name, rich_help_panel=PLUGIN_PANEL)(function)
     if only in (None, LAB):
         app.add_typer(lab, name=LAB, rich_help_panel="Research")
     return app
@@ -99,12 +96,6 @@ def make_command(only: str | None = None) -> Any:
     return command
 
 
-def print_help(context: typer.Context) -> None:
-    """Print the help of a group that is called without a command."""
-    if context.invoked_subcommand is None:
-        print(context.get_help())
-
-
 def _is_research(entry: EntryPoint) -> bool:
     """Return whether a plugin is a research command of this package, and not a command of another package."""
     return entry.module.startswith("gsmerge.")
@@ -113,7 +104,7 @@ def _is_research(entry: EntryPoint) -> bool:
 def _command_of(words: list[str]) -> str | None:
     """Return the name of the only command to import; None if all are needed, to show the help or an error."""
     name = words[0] if words else ""
-    if name in (*OWN_COMMANDS, LAB, LOOK):
+    if name in (*OWN_COMMANDS, LAB):
         return name
     entry = find_plugins(PLUGINS).get(name)
     return None if entry is None or _is_research(entry) else name
@@ -143,7 +134,6 @@ def _print_version(value: bool) -> None:
 
 
 def root(
-    context: typer.Context,
     _: Annotated[
         bool, typer.Option("--version", help="Print the version.", callback=_print_version, is_eager=True)
     ] = False,
@@ -152,7 +142,6 @@ def root(
     ] = False,
 ) -> None:
     """Compact per-pixel 3D Gaussian scenes: 1 to 10 % of the Gaussians, seconds on a CPU."""
-    print_help(context)
 
 
 @contextmanager
@@ -241,8 +230,9 @@ def run(args: Sequence[str] | None = None) -> int:
     try:
         with plain_warnings(), _orderly_stop(signals), print_style():
             _check_working_directory()
-            words = [LOOK, *words] if words and _names_scene(words[0]) else words
-            words = [*words[1:], "--help"] if words[:1] == ["help"] else words
+            words = ["compact", "--open", *words] if words and _names_scene(words[0]) else words
+            if words[:1] == ["help"] or words in ([], [LAB]):
+                words = [word for word in (*words, "--help") if word != "help"]
             command = make_command(_command_of(words))
             code = command(args=words, prog_name=PROGRAM, standalone_mode=False) or 0
             with suppress(BrokenPipeError):  # the reader of a pipe has closed it

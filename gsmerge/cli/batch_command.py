@@ -1,15 +1,13 @@
 """``gsmerge batch``: many scenes, each on its own."""
 
-from __future__ import annotations
-
 import json
 import sys
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
-from functools import partial
-from typing import TYPE_CHECKING, Any, Literal
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import RunEnd, print_document, say, separate_stdout, terminal_columns, total_progress
@@ -23,7 +21,7 @@ from gsmerge.values.words import count_words
 if TYPE_CHECKING:
     from gsmerge.batch import BatchOptions, Job
 
-JOBS = Setting("", kind=int | Literal["auto"], least=1)
+JOBS = Setting("Number of scenes to run at the same time, or auto.", kind=int | Literal["auto"], least=1)
 MAX_LISTED = 20  # rows of the table, failures, and doubtful results
 TABLE_HEADER = ("result", "Gaussians", "of", "kept", "new views", "own before", "own after", "seconds")
 OMITTED_FIRST = ("of", "seconds", "own before", "own after", "kept")  # columns that a narrow terminal omits, in order
@@ -34,115 +32,119 @@ REASONS = {
 }  # fmt: skip
 
 
-@opt.command(
-    opt.argument("scenes", list[str], "FOLDER|PATTERN|LIST...", "Folders to search for scenes, patterns such as *.ply, "
-                 ".ply files, or text files with one of these per line."),
-    *opt.panel(
-        opt.INPUT_GROUP,
-        opt.option("cameras", str, "Cameras: one path for all scenes, or a pattern in which {scene}, {parent} and "
-                   "{stem} are replaced by those of each scene; none: without.", wording="beside each"),
-        opt.option("images", str, "Folder of the photos: a path or such a pattern; none: without.",
-                   wording="beside each"),
-        opt.option("masks", str, "Folder of the masks of the photos, as in compact: a path or such a pattern, as "
-                   "'{parent}/masks'; none: without.",
-                   wording="beside the photos of each"),
-        opt.option("protect", str, "Folder of images, white where a text or a face has to stay sharp: a path or such "
-                   "a pattern."),
-    ),
-    "hint budget quality effort",
-    opt.settings_option(CompactOptions, Engine, example="fit=none"),
-    *opt.panel(
-        "Running",
-        opt.option("jobs", str, "Number of scenes to run at the same time, or auto.", wording="auto",
-                   metavar="N|auto",
-                   parser=partial(opt.parse_value, "--jobs", declared=JOBS)),
-    ),
-    "engine",
-    opt.output("Folder for the results. Scenes whose results are already in it are skipped.", default=opt.REQUIRED),
-    *opt.panel(
-        opt.OUTPUT_GROUP,
-        opt.option("name", str, "Name of each result; {stem}, {parent}, {index} and {k} are replaced.",
-                   default="{stem}.ply", metavar="NAME"),
-    ),
-    opt.change_option("overwrite", False, help="Compact all scenes again. Also replace files in the folder that were "
-                "not written by a batch with these settings."),
-    "strict dry_run seed",
-    opt.change_option("threads", help="Number of threads of each scene.", show_default="processors divided by jobs"),
-    opt.change_option("json", False, help="Print one line of JSON per scene on stdout."),
-)  # fmt: skip
-def batch(args: opt.Args) -> None:
+SETTINGS = (CompactOptions, Engine)
+
+
+def batch(
+    scenes: Annotated[list[str], opt.argument("FOLDER|PATTERN|LIST...", "Folders to search for scenes, patterns such "
+        "as *.ply, .ply files, or text files with one of these per line.", read=None)],
+    *,
+    cameras: Annotated[str | None, opt.option(opt.INPUT, "TEXT", "Cameras: one path for all scenes, or a pattern in "
+        "which {scene}, {parent} and {stem} are replaced by those of each scene; none: without.",
+        default="beside each")] = None,
+    images: Annotated[str | None, opt.option(opt.INPUT, "TEXT", "Folder of the photos: a path or such a pattern; none: "
+        "without.", default="beside each")] = None,
+    masks: Annotated[str | None, opt.option(opt.INPUT, "TEXT", "Folder of the masks of the photos, as in compact: a "
+        "path or such a pattern, as '{parent}/masks'; none: without.", default="beside the photos of each")] = None,
+    protect: Annotated[str | None, opt.option(opt.INPUT, "TEXT", "Folder of images, white where a text or a face has "
+        "to stay sharp: a path or such a pattern.")] = None,
+    hint: opt.Hint = None, budget: opt.Budget = None, quality: opt.Quality = None, levels: opt.Levels = None,
+    k: opt.K = None, effort: opt.Effort = None, fit: opt.Fit = None,
+    set: Annotated[list[str] | None, opt.settings_option(SETTINGS)] = None,
+    jobs: Annotated[opt.Parsed | None, opt.option(opt.RUNNING, "N|auto", JOBS.help, read=opt.reader(JOBS.read),
+        default=AUTO)] = None,
+    engine: opt.OnRay = None, crop: opt.Crop = None, drop: opt.Drop = None,
+    output: Annotated[Path, opt.output("Folder for the results. Scenes whose results are already in it are skipped.")],
+    name: Annotated[str, opt.option(opt.OUTPUT, "NAME", "Name of each result; {stem}, {parent}, {index} and {k} are "
+        "replaced.", default="{stem}.ply")] = "{stem}.ply",
+    overwrite: Annotated[bool, opt.option(opt.OUTPUT, "", "Compact all scenes again. Also replace files in the folder "
+        "that were not written by a batch with these settings.", "--overwrite")] = False,
+    strict: opt.Strict = False, dry_run: opt.DryRun = False, seed: opt.Seed = None,
+    threads: Annotated[str | None, opt.option(opt.GENERAL, "NUMBER", "Number of threads of each scene.",
+        default="processors divided by jobs")] = None,
+    json: Annotated[bool, opt.option(opt.OUTPUT, "", "Print one line of JSON per scene on stdout.", "--json")] = False,
+    progress: opt.Progress = None, quiet: opt.Quiet = False,
+) -> None:  # fmt: skip
     """Compact many scenes, each on its own. A failure stops no other scene, and a second call continues."""
-    out = args.output
-    if out.exists() and not out.is_dir():
-        raise UsageError(f"--output: expected a folder, found the file {out}")
-    hints = args.hints()
+    if output.exists() and not output.is_dir():
+        raise UsageError(f"--output: expected a folder, found the file {output}")
+    reading = opt.read_hints(hint)
+    given = opt.read_settings(
+        SETTINGS, set, budget=budget, quality=quality, levels=levels, k=k, effort=effort, fit=fit, crop=crop, drop=drop,
+        engine=engine, seed=seed, threads=threads,
+    )  # fmt: skip
     from gsmerge.batch import BatchOptions, find_jobs
     from gsmerge.batch.find import describe_lost
     from gsmerge.batch.records import RecordIndex
 
-    settings, engine = args.make(CompactOptions, Engine)
+    settings, ray = given.make(*SETTINGS)
     try:
         options = BatchOptions(
-            settings, args.opacity, hints, args.cameras, args.images, args.masks, args.protect, args.name,
-            None if args.jobs == AUTO else args.jobs, args.overwrite, engine.engine, engine.address,
+            settings, *reading, cameras, images, masks, protect, name, None if jobs == AUTO else jobs, overwrite,
+            ray.engine, ray.address,
         )  # fmt: skip
     except ValueError as error:
         raise UsageError(str(error).replace("output:", "--name:", 1)) from error
-    if options.engine == "ray" and not args.dry_run:
+    if options.engine == "ray" and not dry_run:
         from gsmerge.runtime.work import require_ray
 
         require_ray()
     looks: list[str] = []
-    jobs = find_jobs(args.scenes, out, options, set(RecordIndex(out).read_on().paths()), looks)
-    notes = describe_lost(looks, {job.scene for job in jobs})
-    if args.dry_run:
-        _print_plan(args, jobs, options, notes)
+    planned = find_jobs(scenes, output, options, {*RecordIndex(output).read_on().paths()}, looks)
+    notes = describe_lost(looks, {job.scene for job in planned})
+    if dry_run:
+        _print_plan(output, planned, options, notes, as_json=json)
     else:
-        _run(args, jobs, options, notes)
+        _run(output, planned, options, notes, strict=strict, json=json, quiet=quiet)
 
 
-def _run(args: opt.Args, jobs: Sequence[Job], options: BatchOptions, notes: Sequence[str]) -> None:
+def _run(
+    out: Path, jobs: "Sequence[Job]", options: "BatchOptions", notes: Sequence[str], *,
+    strict: bool, json: bool, quiet: bool,
+) -> None:  # fmt: skip
     """Compact all scenes, print a summary, and raise an error if some failed or missed their target."""
     from gsmerge.batch.run import choose_concurrency
 
-    totals = Totals(len(jobs))
-    say(f"{count_words(len(jobs), 'scene')}, {choose_concurrency(jobs, options)}", quiet=args.silent)
+    totals, silent = Totals(len(jobs)), quiet or json
+    say(f"{count_words(len(jobs), 'scene')}, {choose_concurrency(jobs, options)}", quiet=silent)
 
     try:
-        _run_jobs(args, jobs, options, totals)
+        _run_jobs(out, jobs, options, totals, as_json=json, quiet=silent)
     finally:
-        if not args.silent:
+        if not silent:
             print_document(
                 {}, [*totals.lines(terminal_columns(sys.stdout)), *map("note: {}".format, notes)], as_json=False
             )
     doubtful, results = totals.reasons["doubt"], count_words(totals.total - len(totals.reasons["error"]), "result")
     problem = (
         f"{len(doubtful)} of {results} {'is' if len(doubtful) == 1 else 'are'} doubtful"
-        f"{_first_reason(doubtful, listed=not args.silent)}"
+        f"{_first_reason(doubtful, listed=not silent)}"
     )
-    if doubtful and not args.strict:
-        say(problem, kind="warning", quiet=args.silent)
-    check_failures(totals.reasons["error"], len(jobs), "scene", listed=not args.silent)
+    if doubtful and not strict:
+        say(problem, kind="warning", quiet=silent)
+    check_failures(totals.reasons["error"], len(jobs), "scene", listed=not silent)
     if unmet := totals.reasons["unmet"]:
-        raise TargetError(f"{len(unmet)} of {results} missed the target{_first_reason(unmet, listed=not args.silent)}")
-    if doubtful and args.strict:
+        raise TargetError(f"{len(unmet)} of {results} missed the target{_first_reason(unmet, listed=not silent)}")
+    if doubtful and strict:
         raise TargetError(problem)
 
 
-def _run_jobs(args: opt.Args, jobs: Sequence[Job], options: BatchOptions, totals: Totals) -> None:
+def _run_jobs(
+    out: Path, jobs: "Sequence[Job]", options: "BatchOptions", totals: "Totals", *, as_json: bool, quiet: bool
+) -> None:
     """Compact the scenes of all jobs, add each record to the totals, and print it with ``--json``."""
     from gsmerge.batch import run_batch
     from gsmerge.batch.records import FAILED, SKIPPED
 
     stdout = sys.stdout
     with (
-        separate_stdout(options.engine, quiet=args.silent),
-        closing(run_batch(jobs, args.output, options)) as records,
-        total_progress(len(jobs), quiet=args.silent) as progress,
+        separate_stdout(options.engine, quiet=quiet),
+        closing(run_batch(jobs, out, options)) as records,
+        total_progress(len(jobs), quiet=quiet) as progress,
     ):
         for num_ended, record in enumerate(records, 1):
             totals.add(record)
-            if args.json:
+            if as_json:
                 print(json.dumps(record, separators=(",", ":")), file=stdout, flush=True)
             failure, num_skipped = record["error"] or "", totals.counts[SKIPPED]
             # skipped scenes take no time, so the time left is estimated without them
@@ -271,12 +273,14 @@ def _row(output: str, report: Mapping[str, Any]) -> tuple[str, ...]:
     return output, *counts, human_share(report["ratio"]), gain, *quality, f"{report['total_seconds']:.1f}"
 
 
-def _print_plan(args: opt.Args, jobs: Sequence[Job], options: BatchOptions, notes: Sequence[str]) -> None:
+def _print_plan(
+    out: Path, jobs: "Sequence[Job]", options: "BatchOptions", notes: Sequence[str], *, as_json: bool
+) -> None:
     """Print which scenes a batch would compact, for ``--dry-run``; BatchError if some would fail."""
     from gsmerge.batch.run import choose_concurrency, pending_jobs
     from gsmerge.measure.documents import document_head, note_entries
 
-    out, pending = args.output, pending_jobs(jobs, args.output, options)
+    pending = pending_jobs(jobs, out, options)
     concurrency = choose_concurrency(jobs, options)
     pending_scenes = {job.scene: refusal for job, refusal in pending}  # None: the scene would be compacted
     num_refused = sum(refusal is not None for refusal in pending_scenes.values())
@@ -307,7 +311,7 @@ def _print_plan(args: opt.Args, jobs: Sequence[Job], options: BatchOptions, note
         f"would write {out}: {num_pending:,} of {count_words(len(jobs), 'scene')} to do, {concurrency}",
         *map("note: {}".format, notes),
     ]
-    print_document(document, lines, as_json=args.json)
+    print_document(document, lines, as_json=as_json)
     if num_refused:
         raise BatchError(
             f"{num_refused:,} of {count_words(len(jobs), 'scene')} would fail;"

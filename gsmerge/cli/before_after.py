@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gsmerge.cli.parameters import Args, usage_errors
+from gsmerge.cli.parameters import Reading, usage_errors
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.settings.evaluate import NETS, EvaluateOptions
 
@@ -61,33 +61,36 @@ class BeforeAfter:
         return {name: ply.gaussians for name, ply in self.plys.items()}
 
 
-def read_before_after(args: Args, files: SceneFiles) -> BeforeAfter:
+def read_before_after(
+    files: SceneFiles, after: Sequence[Path], reading: Reading, *, loaded: Loaded | None = None,
+    targets: Path | None = None, target_images: Path | None = None, views: int | None = None,
+) -> BeforeAfter:  # fmt: skip
     """Read a scene, its compact versions, and the held-out views of ``--targets``.
 
-    ``files`` are the files of the scene. If the scene has no views, some views are placed.
+    ``files`` are the files of the scene, which may be ``loaded`` already. If it has no views, some views are placed.
     """
     from gsmerge.facts.place_cameras import NO_VIEWS, PLACED_VIEWS, add_views
     from gsmerge.io import read_gaussians
     from gsmerge.io.scene_files import result_cameras
     from gsmerge.runtime.record import record_run
+    from gsmerge.scene.read import load_files
 
     if files.cameras is None and "cameras" not in files.named:  # a result may have cameras although its scene has none
-        files = replace(files, cameras=next(filter(None, map(result_cameras, args.after)), None))
-    load = args.load(files)
-    views = vars(args).get("views")
-    if args.targets is not None or views is not None:
+        files = replace(files, cameras=next(filter(None, map(result_cameras, after)), None))
+    load = loaded if loaded is not None and loaded.files == files else load_files(files, **reading._asdict())
+    if targets is not None or views is not None:
         require_views(load)
-    scene, held_out, target_notes = held_out_views(load, args.targets, vars(args).get("target_images"), views)
+    scene, held_out, target_notes = held_out_views(load, targets, target_images, views)
     with record_run() as record:
-        scene = add_views(scene, shown=True, placed=NO_VIEWS if args.after else PLACED_VIEWS)
+        scene = add_views(scene, shown=True, placed=NO_VIEWS if after else PLACED_VIEWS)
     notes = [*record.notes]
-    plys = {name: read_gaussians(path) for name, path in zip(file_names(args.after), args.after, strict=True)}
+    plys = {name: read_gaussians(path) for name, path in zip(file_names(after), after, strict=True)}
     if plys and all(ply.info.count > load.info.count for ply in plys.values()):
         notes.append(
             f"{files.ply.name} has fewer Gaussians than the files it is compared with; perhaps BEFORE and AFTER are"
             " swapped"
         )
-    cameras, camera_notes = own_cameras(args.after, scene)
+    cameras, camera_notes = own_cameras(after, scene)
     return BeforeAfter(load, scene, held_out, plys, cameras, [*load.notes, *target_notes, *notes, *camera_notes])
 
 

@@ -1,9 +1,7 @@
 """``gsmerge convert``: convert, join, crop and transform Gaussians, without merging or fitting."""
 
-from __future__ import annotations
-
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import print_document, say, say_notes, stage_progress
@@ -11,45 +9,45 @@ from gsmerge.cli.paths import check_outputs, output_file
 from gsmerge.errors import UsageError
 from gsmerge.settings.files import FileOptions
 from gsmerge.settings.placement import PlacementOptions
-from gsmerge.settings.setting import Settings, setting
 from gsmerge.settings.stages import CleanOptions
 
-
-@dataclass(frozen=True)
-class PhotoOptions(Settings):
-    """Photos that a conversion reads."""
-
-    images: str | None = setting(None, "Folder of the photos of the cameras, which `--drop sky` needs.")
+SETTINGS = (FileOptions, CleanOptions, PlacementOptions)
 
 
-@opt.command(
-    opt.argument("paths", list[Path], "IN... OUT",
-                 "Files or folders of Gaussians, such as a .ply, .spz or .sog. Several files in one coordinate frame "
-                 "are joined. The last path is the output, and its name sets the format, also .html (a page to send), "
-                 "lod-meta.json, or a folder."),
-    opt.change_option("cameras", help="Cameras in the frame of the first file; they are transformed as well. Default: "
-                "the cameras inside a result or beside it; none: without."),
-    opt.change_option("hint", help="How the files store opacity, scales and colours, if it is not recognised: "
-                "opacity=logit or raw, scales=log or linear, colors=sh or rgb."),
-    opt.settings_option(FileOptions, PhotoOptions, CleanOptions, PlacementOptions, example="normals=false"),
-    "up scale rotate translate sh_degree crop drop overwrite",
-)  # fmt: skip
-def convert(args: opt.Args) -> None:
+def convert(
+    paths: Annotated[list[Path], opt.argument("IN... OUT", "Files or folders of Gaussians, such as a .ply, .spz or "
+        ".sog. Several files in one coordinate frame are joined. The last path is the output, and its name sets the "
+        "format, also .html (a page to send), lod-meta.json, or a folder.")],
+    cameras: Annotated[opt.Parsed | None, opt.option(opt.INPUT, "PATH", "Cameras in the frame of the first file; they "
+        "are transformed as well. Default: the cameras inside a result or beside it; none: without.",
+        read=opt.path_or_none)] = None,
+    images: Annotated[opt.Parsed | None, opt.option(opt.INPUT, "PATH", "Folder of the photos of the cameras, which "
+        "--drop sky needs.", read=opt.path_or_none)] = None,
+    hint: Annotated[list[str] | None, opt.option(opt.INPUT, "NAME=VALUE", "How the files store opacity, scales and "
+        "colours, if it is not recognised: opacity=logit or raw, scales=log or linear, colors=sh or rgb.")] = None,
+    set: Annotated[list[str] | None, opt.settings_option(SETTINGS, example="normals=false")] = None,
+    up: opt.Up = None, scale: opt.Scale = None, rotate: opt.Rotate = None, translate: opt.Translate = None,
+    sh_degree: opt.ShDegree = None, crop: opt.Crop = None, drop: opt.Drop = None, overwrite: opt.Overwrite = False,
+    threads: opt.OwnThreads = None, json: opt.Json = False, progress: opt.Progress = None,
+    quiet: opt.Quiet = False,
+) -> None:  # fmt: skip
     """Write Gaussians in another format, frame or extent, without merging or fitting them."""
-    *inputs, output = args.paths
+    given = opt.read_settings(
+        SETTINGS, set, up=up, scale=scale, rotate=rotate, translate=translate, sh_degree=sh_degree, crop=crop, drop=drop
+    )
+    *inputs, output = paths
     if not inputs:
         remedy = f"name the output last, as in gsmerge convert {output} x.spz"
         raise UsageError(f"expected files to read and one to write, got only {output}; {remedy}")
     from gsmerge.io.scene_files import find_plys
 
     inputs = [file for path in inputs for file in (find_plys(path) if path.is_dir() else [path])]
-    writing, photos, cleaning, placement = args.make(FileOptions, PhotoOptions, CleanOptions, PlacementOptions)
-    images = None if photos.images is None else opt.named_or_none(photos.images)
-    named = [path for path in (args.cameras, images) if isinstance(path, Path)]
+    writing, cleaning, placement = given.make(*SETTINGS)
+    named = [path for path in (cameras, images) if isinstance(path, Path)]
     from gsmerge.compaction.outputs import name_outputs
 
-    outputs = name_outputs(output_file(output, inputs[0].name), writing, overwrite=args.overwrite)
-    check_outputs(outputs.paths, (*inputs, *named), overwrite=args.overwrite)
+    outputs = name_outputs(output_file(output, inputs[0].name), writing, overwrite=overwrite)
+    check_outputs(outputs.paths, (*inputs, *named), overwrite=overwrite)
     from gsmerge.compaction.convert import ConvertOptions, conversion_line, convert_files
     from gsmerge.io.formats.table import estimate_counts
     from gsmerge.runtime.memory import conversion_bytes, memory_problem
@@ -57,12 +55,13 @@ def convert(args: opt.Args) -> None:
 
     remedy = "a .ply takes least, and parts of the scene can be converted one by one"
     if problem := memory_problem(conversion_bytes(*estimate_counts(inputs)), remedy):
-        say(problem, kind="warning", quiet=args.silent)
-    hints = args.hints()
+        say(problem, kind="warning", quiet=quiet or json)
+    reading = opt.read_hints(hint)
+    hints = reading.hints
     options = ConvertOptions(
-        inputs, outputs, args.cameras, images, args.opacity, hints.scales, hints.colors, cleaning, placement,
+        inputs, outputs, cameras, images, reading.opacity, hints.scales, hints.colors, cleaning, placement,
     )  # fmt: skip
-    with stage_progress(quiet=args.silent) as progress, record_run(progress):
+    with stage_progress(quiet=quiet or json) as on_step, record_run(on_step):
         document = convert_files(options)
-    say_notes(document["notes"], quiet=args.silent)
-    print_document(document, conversion_line(document), as_json=args.json, quiet=args.quiet)
+    say_notes(document["notes"], quiet=quiet or json)
+    print_document(document, conversion_line(document), as_json=json, quiet=quiet)

@@ -1,60 +1,62 @@
 """``gsmerge extend``: add views that arrive in batches to a state."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import Annotated, Any
 
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import print_document, say_notes, stage_progress
 from gsmerge.cli.paths import input_files
 from gsmerge.errors import UsageError
 from gsmerge.settings.compact import CompactOptions
-from gsmerge.settings.extend import ExtendOptions
+from gsmerge.settings.extend import ExtendOptions, batch_settings
 from gsmerge.settings.reading import NONE
 
+SETTINGS = (CompactOptions, ExtendOptions)
 
-@opt.command(
-    opt.argument("state", Path, "STATE", "A .gsm file; the first batch creates it."),
-    opt.argument(
-        "scenes", list[Path], "SCENE...", "Batches of new views, in order; each is a scene as compact takes it."
-    ),
-    opt.READING,
-    "dry_run",
-    opt.settings_option(CompactOptions, ExtendOptions, example="budget=2%"),
-)
-def extend(args: opt.Args) -> None:
+
+def extend(
+    state: Annotated[Path, opt.argument("STATE", "A .gsm file; the first batch creates it.", opt.read_path)],
+    scenes: Annotated[list[Path], opt.argument("SCENE...", "Batches of new views, in order; each is a scene as compact "
+        "takes it.")],
+    cameras: opt.Cameras = None, images: opt.Images = None, hint: opt.Hint = None, dry_run: opt.DryRun = False,
+    set: Annotated[list[str] | None, opt.settings_option(SETTINGS, example="budget=2%")] = None,
+    threads: opt.Threads = None, json: opt.Json = False, progress: opt.Progress = None, quiet: opt.Quiet = False,
+) -> None:  # fmt: skip
     """Compact new views and add them to a state, from which gsmerge compact makes a result at any time."""
     from gsmerge.io.formats.table import STATE_ENDING
+    from gsmerge.io.scene_files import find_scene_files
 
-    if args.state.suffix.lower() != STATE_ENDING:
-        raise UsageError(f"{args.state}: expected a state whose name ends in {STATE_ENDING}")
-    hints, scenes = args.hints(), args.scenes
-    if len(scenes) > 1 and {args.cameras, args.images} - {None, NONE}:
+    start = perf_counter()
+    if state.suffix.lower() != STATE_ENDING:
+        raise UsageError(f"{state}: expected a state whose name ends in {STATE_ENDING}")
+    reading = opt.read_hints(hint)
+    if len(scenes) > 1 and {cameras, images} - {None, NONE}:
         raise UsageError("--cameras and --images: expected one batch with them, got several; add one batch at a time")
     from gsmerge.states.files import batch_line, extend_file
 
-    settings = args.values(CompactOptions, ExtendOptions)
-    batches = [args.files(scene) for scene in scenes]
+    given = opt.read_settings(SETTINGS, set, threads=threads)
+    with given.usage_errors():
+        batch_settings(given.values)
+    batches = [find_scene_files(scene, cameras=cameras, images=images) for scene in scenes]
     for files in batches:
-        if any(path.resolve() == args.state.resolve() for path in input_files(files)):
-            raise UsageError(f"{args.state}: expected a state other than the input; name another file")
-    documents, trial_state = list[dict[str, Any]](), None  # in a dry run, the state that no file holds
+        if any(path.resolve() == state.resolve() for path in input_files(files)):
+            raise UsageError(f"{state}: expected a state other than the input; name another file")
+    documents, tried = list[dict[str, Any]](), None  # in a dry run, the state that no file holds
     for files in batches:
-        before = {"import": perf_counter() - args.start} if not documents else {}
-        with stage_progress(quiet=args.silent) as progress:
-            document, state = extend_file(
-                args.state, files, settings, opacity=args.opacity, hints=hints, progress=progress,
-                seconds_before=before, dry_run=args.dry_run, tried=trial_state,
+        before = {"import": perf_counter() - start} if not documents else {}
+        with stage_progress(quiet=quiet or json) as on_step:
+            document, extended = extend_file(
+                state, files, given.values, opacity=reading.opacity, hints=reading.hints, progress=on_step,
+                seconds_before=before, dry_run=dry_run, tried=tried,
             )  # fmt: skip
-        trial_state = state if args.dry_run else None
+        tried = extended if dry_run else None
         documents.append(document)
-        say_notes(document["notes"], quiet=args.silent)
-        if not args.silent:
+        say_notes(document["notes"], quiet=quiet or json)
+        if not (quiet or json):
             print_document(document, batch_line(document), as_json=False)
-    if args.json:
+    if json:
         from gsmerge.measure.documents import document_head, note_entries, to_json
 
         notes = note_entries(note for document in documents for note in document["notes"])

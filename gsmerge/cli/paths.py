@@ -72,7 +72,7 @@ def _check_output(output: Path, inputs: set[str], *, overwrite: bool, reports: b
     is_image = target.suffix.lower() in IMAGE_SUFFIXES and target.exists()
     if str(target) in inputs or (is_image and str(target.parent) in inputs):
         raise UsageError(f"{output}: expected an output other than the input; name another output")
-    if os.path.lexists(output) and not (may_be_replaced(output) if reports else overwrite):
+    if os.path.lexists(output) and not (overwrite or (reports and may_be_replaced(output))):
         problem = f"{output}: {describe_existing(output)}"
         raise UsageError(
             f"{problem} and is not a report of gsmerge; name another output" if reports

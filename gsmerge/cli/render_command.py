@@ -1,15 +1,16 @@
 """``gsmerge render``: draw pictures of scenes from their cameras, and clips along paths."""
 
-from __future__ import annotations
-
 import re
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated, Any
 
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import print_document, say_notes, stage_progress
 from gsmerge.cli.paths import check_folder, check_outputs, input_files
 from gsmerge.errors import UsageError
 from gsmerge.settings.pictures import CLIPS, PICTURES
+from gsmerge.settings.setting import Setting
 
 MAX_SIDE = 1 << 20  # pixels; larger than any camera, so that pictures keep the size of the cameras
 
@@ -36,98 +37,99 @@ def parse_views(text: str) -> int | str:
     return count
 
 
-@opt.command(
-    opt.argument("scenes", list[Path], "SCENES...", "Files of Gaussians: before, after, ... The first may be a "
-                 "folder."),
-    opt.READING,
-    opt.output("A picture, .png or .jpg: a panel of photos and scenes, or with --views NAME one view of one scene. A "
-               "clip, .mp4, .webm or .gif; a moving line separates two scenes. A folder gets a picture of each camera.",
-               default=opt.REQUIRED),
-    *opt.panel(
-        opt.OUTPUT_GROUP,
-        opt.option("path", str, "Path of the camera. orbit: about the middle view, orbit:45 by 45 degrees to each "
-                   "side; spline: through all views. With ,back:0.5 it moves back by half of the depth. Or a file "
-                   "with a camera for each frame.",
-                   wording="orbit, none for a folder", metavar="orbit|spline|FILE"),
-        opt.option("size", str, "Width and height in pixels, in a panel of each picture. Views with another aspect "
-                   "ratio are cropped on two sides.", wording="the cameras', of a GIF at most 640",
-                   metavar="WIDTHxHEIGHT", parser=parse_size),
-        opt.option("frames", int, "Number of frames of a clip, at 30 frames per second, or 12.5 in a GIF.",
-                   wording="4 seconds", min=2, max=100_000),
-        opt.option("views", str, "Largest number of views, at equal intervals; or the name of one view, such as "
-                   "00006 or 6.jpg (6 would be a number).", metavar="NUMBER|NAME", parser=parse_views,
-                   wording="4 on a panel, else all"),
-        opt.option("background", float, "Grey level behind the scene, 0 to 1.", wording="0", metavar="LEVEL", min=0,
-                   max=1),
-    ),
-    "overwrite",
-)  # fmt: skip
-def render(args: opt.Args) -> None:
+FRAMES = Setting("Number of frames of a clip, at 30 frames per second, or 12.5 in a GIF.", kind=int, least=2,
+                 most=100_000)  # fmt: skip
+BACKGROUND = Setting("Grey level behind the scene, 0 to 1.", kind=float, least=0, most=1)
+
+
+def render(
+    scenes: Annotated[list[Path], opt.argument("SCENES...", "Files of Gaussians: before, after, ... The first may be a "
+        "folder.")],
+    *,
+    cameras: opt.Cameras = None, images: opt.Images = None, hint: opt.Hint = None,
+    output: Annotated[Path, opt.output("A picture, .png or .jpg: a panel of photos and scenes, or with --views "
+        "NAME one view of one scene. A clip, .mp4, .webm or .gif; a moving line separates two scenes. A folder gets a "
+        "picture of each camera.")],
+    path: Annotated[str | None, opt.option(opt.OUTPUT, "orbit|spline|FILE", "Path of the camera. orbit: about the "
+        "middle view, orbit:45 by 45 degrees to each side; spline: through all views. With ,back:0.5 it moves back by "
+        "half of the depth. Or a file with a camera for each frame.", default="orbit, none for a folder")] = None,
+    size: Annotated[opt.Parsed | None, opt.option(opt.OUTPUT, "WIDTHxHEIGHT", "Width and height in pixels, in a panel "
+        "of each picture. Views with another aspect ratio are cropped on two sides.", read=opt.reader(parse_size),
+        default="the cameras', of a GIF at most 640")] = None,
+    frames: Annotated[opt.Parsed | None, opt.option(opt.OUTPUT, "NUMBER", FRAMES.help, read=opt.reader(FRAMES.read),
+        default="4 seconds")] = None,
+    views: Annotated[opt.Parsed | None, opt.option(opt.OUTPUT, "NUMBER|NAME", "Largest number of views, at "
+        "equal intervals; or the name of one view, such as 00006 or 6.jpg (6 would be a number).",
+        read=opt.reader(parse_views), default="4 on a panel, else all")] = None,
+    background: Annotated[opt.Parsed, opt.option(opt.OUTPUT, "LEVEL", BACKGROUND.help, default=0,
+        read=opt.reader(BACKGROUND.read))] = "0",
+    overwrite: opt.Overwrite = False, threads: opt.OwnThreads = None, json: opt.Json = False,
+    progress: opt.Progress = None, quiet: opt.Quiet = False,
+) -> None:  # fmt: skip
     """Draw scenes: a clip of before and after, a panel with the photos, or a picture for each camera."""
-    kind = _choose_kind(args)
+    kind = _choose_kind(output, scenes, path, frames, views)
+    path = path or ("orbit" if kind == "path" else None)
+    from gsmerge.io.scene_files import find_scene_files
     from gsmerge.measure import drawings
     from gsmerge.measure.camera_path import parse_camera_path
     from gsmerge.measure.documents import document_head, note_entries
 
-    files = args.files(args.scenes[0])
-    framing = drawings.frame_files(files, args.cameras, args.images)
-    inputs = (*args.scenes, *input_files(files), *input_files(framing))
-    if args.path is not None and parse_camera_path(args.path) is None:  # the path is a file
-        inputs = (*inputs, Path(args.path))
-    if args.output.suffix.lower() in (*PICTURES, *CLIPS):
+    files = find_scene_files(scenes[0], cameras=cameras, images=images)
+    framing = drawings.frame_files(files, cameras, images)
+    inputs = (*scenes, *input_files(files), *input_files(framing))
+    if path is not None and parse_camera_path(path) is None:  # the path is a file
+        inputs = (*inputs, Path(path))
+    if output.suffix.lower() in (*PICTURES, *CLIPS):
         # A picture in the folder of a scene may be replaced, unless it is a photo of this scene
-        read = [path for path in inputs if path not in args.scenes or not path.is_dir()]
-        check_outputs((args.output,), (*read, files.images), overwrite=args.overwrite)
+        read = [one for one in inputs if one not in scenes or not one.is_dir()]
+        check_outputs((output,), (*read, files.images), overwrite=overwrite)
     else:
-        check_folder(args.output, inputs, overwrite=args.overwrite)
-    hints = args.hints(max_side=MAX_SIDE) if kind == "views" else args.hints()
-    arguments = args.get_given(("views", "path", "frames", "size", "background"))
+        check_folder(output, inputs, overwrite=overwrite)
+    reading = opt.read_hints(hint, **({"max_side": MAX_SIDE} if kind == "views" else {}))
     drawing = drawings.DRAWINGS[kind](
-        drawings.DrawOptions(files, args.scenes, framing, args.output, args.opacity, hints, **arguments)
+        drawings.DrawOptions(files, scenes, framing, output, *reading, views, path, frames, size, background)
     )
-    document = {**document_head(), "output": str(args.output), "pictures": [str(path) for path in drawing.paths]}
+    document = {**document_head(), "output": str(output), "pictures": [str(picture) for picture in drawing.paths]}
     document |= drawing.facts | note_entries(drawing.facts["notes"])
-    say_notes(document["notes"], quiet=args.silent)
-    with stage_progress(quiet=args.silent) as progress:
-        document |= drawings.write_drawing(drawing, overwrite=args.overwrite, progress=progress)
-    line = f"{args.output}: {drawings.drawing_line(document)}"
-    print_document(document, line, as_json=args.json, quiet=args.quiet)
+    say_notes(document["notes"], quiet=quiet or json)
+    with stage_progress(quiet=quiet or json) as on_step:
+        document |= drawings.write_drawing(drawing, overwrite=overwrite, progress=on_step)
+    line = f"{output}: {drawings.drawing_line(document)}"
+    print_document(document, line, as_json=json, quiet=quiet)
 
 
-def _choose_kind(args: opt.Args) -> str:
+def _choose_kind(output: Path, scenes: Sequence[Path], path: str | None, frames: Any, views: Any) -> str:
     """Return the kind of drawing, by the name of the output and the options.
 
-    Raises UsageError if output and options do not fit each other. A clip without ``--path`` gets the path "orbit".
+    Raises UsageError if output and options do not fit each other. A clip without a ``path`` gets the path "orbit".
     """
-    suffix = args.output.suffix.lower()
+    suffix = output.suffix.lower()
     is_clip, is_picture = suffix in CLIPS, suffix in PICTURES
-    if suffix and not is_clip and not is_picture and not args.output.is_dir():
+    if suffix and not is_clip and not is_picture and not output.is_dir():
         expected = f"a picture, {opt.join_words(PICTURES)}, a clip, {opt.join_words(CLIPS)}, or a folder"
-        raise UsageError(f"{args.output}: expected {expected}")
-    if is_clip and args.path is None:
-        args.path = "orbit"
-    if args.path is not None:
+        raise UsageError(f"{output}: expected {expected}")
+    if is_clip or path is not None:
         if is_picture:
-            raise UsageError(f"{args.output}: expected a clip, {opt.join_words(CLIPS)}, or a folder with --path")
-        if isinstance(args.views, str):
+            raise UsageError(f"{output}: expected a clip, {opt.join_words(CLIPS)}, or a folder with --path")
+        if isinstance(views, str):
             raise UsageError("--views: expected a number of views for a clip or a --path, got a name")
-        _check_path(args)
+        _check_path(path or "orbit", frames)
         return "path"
-    if args.frames is not None:
+    if frames is not None:
         raise UsageError(f"--frames: expected a clip, {opt.join_words(CLIPS)}, or a --path with it")
-    is_single = isinstance(args.views, str) and len(args.scenes) == 1
+    is_single = isinstance(views, str) and len(scenes) == 1
     return "panel" if is_picture and not is_single else "views"
 
 
-def _check_path(args: opt.Args) -> None:
+def _check_path(path: str, frames: Any) -> None:
     """Raise UsageError for an unknown path, or for ``--frames`` with a path that is a file."""
     from gsmerge.measure.camera_path import parse_camera_path
 
     with opt.usage_errors():
-        if parse_camera_path(args.path) is not None:
+        if parse_camera_path(path) is not None:
             return
-    if not Path(args.path).exists():
+    if not Path(path).exists():
         expected = "orbit, spline or a file of cameras"
-        raise UsageError(f"--path {args.path}: expected {expected}, found no such file")
-    if args.frames is not None:
+        raise UsageError(f"--path {path}: expected {expected}, found no such file")
+    if frames is not None:
         raise UsageError("--frames: expected orbit or spline; with a file of cameras, use --views")

@@ -1,57 +1,75 @@
 """``gsmerge view``: show a scene and its compact versions on one page, in stills and in 3D."""
 
-from __future__ import annotations
-
 import os
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.before_after import read_before_after
 from gsmerge.cli.console import print_document, say, say_notes, stage_progress
 from gsmerge.cli.paths import check_outputs, input_files, write_texts
 
+if TYPE_CHECKING:
+    from gsmerge.io.scene_files import SceneFiles
+    from gsmerge.scene.read import Loaded
 
-@opt.command(
-    opt.BEFORE,
-    opt.AFTER,
-    f"{opt.READING} masks targets",
-    opt.output("The page, .html. A page that gsmerge made is replaced.",
-               wording="AFTER.compare.html, or BEFORE.view.html, beside it"),
-    *opt.panel(
-        opt.OUTPUT_GROUP,
-        opt.switch("light", "Show BEFORE only in pictures, and AFTER in 3D; the page has a third of the size."),
-    ),
-    "open",
-)  # fmt: skip
-def view(args: opt.Args) -> None:
+
+def view(
+    before: opt.Before,
+    after: opt.After = None,
+    cameras: opt.Cameras = None, images: opt.Images = None, hint: opt.Hint = None, masks: opt.Masks = None,
+    targets: opt.Targets = None,
+    output: Annotated[Path | None, opt.output("The page, .html.", "AFTER.compare.html, or BEFORE.view.html, "
+        "beside it, replaced if gsmerge made it")] = None,
+    light: Annotated[bool, opt.option(opt.OUTPUT, "", "Show BEFORE only in pictures, and AFTER in 3D; the page has a "
+        "third of the size.", "--light")] = False,
+    open: Annotated[bool, opt.option(opt.OUTPUT, "", "Open the page in the browser.", "--open/--no-open",
+        default="open")] = True,
+    overwrite: opt.Overwrite = False, threads: opt.OwnThreads = None, json: opt.Json = False,
+    progress: opt.Progress = None, quiet: opt.Quiet = False,
+) -> None:  # fmt: skip
     """Show a scene, alone or beside its compact versions, in the browser: photos, stills, 3D and scores in one file."""
+    from gsmerge.io.scene_files import find_scene_files
+
+    files, reading = find_scene_files(before, cameras=cameras, images=images, masks=masks), opt.read_hints(hint)
+    show_page(
+        files, after or [], output, reading, targets=targets, light=light, open=open, overwrite=overwrite, json=json,
+        quiet=quiet,
+    )  # fmt: skip
+
+
+def show_page(
+    files: "SceneFiles", after: list[Path], output: Path | None = None, reading: opt.Reading = opt.Reading(), *,
+    loaded: "Loaded | None" = None, targets: Path | None = None, light: bool = False, open: bool = True,
+    overwrite: bool = False, json: bool = False, quiet: bool = False,
+) -> None:  # fmt: skip
+    """Make the page of a scene, which may be ``loaded`` already, and of its compact versions; open it if ``open``."""
     from gsmerge.io.atomic import common_mode
     from gsmerge.measure.documents import document_head, note_entries
     from gsmerge.pages.data import collect_page_data
     from gsmerge.pages.page import headline, speed, speed_words, view_page
     from gsmerge.pages.view import check_page_name, file_gains
 
-    args.after = args.after or []
-    files, after = args.files(args.before), args.after
+    silent = quiet or json
     default = after[0].with_name(f"{after[0].stem}.compare.html") if after else files.base.with_suffix(".view.html")
-    output = args.output or default
-    shown = [path for path in (*input_files(files), *after, args.targets) if path is not None]
-    check_outputs((output,), shown, reports=True)
+    shown = [path for path in (*input_files(files), *after, targets) if path is not None]
+    check_outputs((output or default,), shown, overwrite=overwrite, reports=output is None)
+    output = output or default
     check_page_name(output)
     mode = common_mode(shown)
-    with stage_progress(quiet=args.silent) as progress:
+    with stage_progress(quiet=silent) as progress:
         progress("read", 0, 0)
-        pair = read_before_after(args, files)
-        say_notes(pair.notes, quiet=args.silent)
+        pair = read_before_after(files, after, reading, loaded=loaded, targets=targets)
+        say_notes(pair.notes, quiet=silent)
         sizes = [pair.load.info.file_bytes, *(ply.info.file_bytes for ply in pair.plys.values())]
         data = collect_page_data(
             pair.title, pair.scene, pair.gaussians, sizes, pair.held_out, cameras=pair.cameras,
-            new_gains=file_gains(pair.plys), light=args.light, progress=progress,
+            new_gains=file_gains(pair.plys), light=light, progress=progress,
         )  # fmt: skip
     page = view_page(data)
     write_texts({output: page}, mode)
-    say_notes(data.notes, quiet=args.silent)
+    say_notes(data.notes, quiet=silent)
     summary = headline(data) + speed_words(speed(data)).replace("\u00a0", " ")
     notes = [*pair.notes, *data.notes]
     document = {
@@ -61,9 +79,9 @@ def view(args: opt.Args) -> None:
         "bytes": len(page),
         "headline": summary,
     }
-    print_document(document, f"{output}: {summary}", as_json=args.json, quiet=args.quiet)
-    if args.open and not _open(output):
-        say(f"open {output.absolute().as_uri()} in a browser", quiet=args.silent)
+    print_document(document, f"{output}: {summary}", as_json=json, quiet=quiet)
+    if open and not _open(output):
+        say(f"open {output.absolute().as_uri()} in a browser", quiet=silent)
 
 
 def _open(page: Path) -> bool:

@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from os import PathLike
 from time import perf_counter
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from gsmerge.compaction.candidate import Candidate, score
 from gsmerge.compaction.costs import run_parts
@@ -45,6 +45,11 @@ from gsmerge.settings.reading import OpacityChoice
 from gsmerge.types import Scene, StrPath
 from gsmerge.values.arguments import check_arguments
 
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+    from gsmerge.settings.keywords import CompactSettings
+
 # If a result is clearly worse than its input, the scene is compacted again with these changes of the options, one after
 # another, until a result is not clearly worse. A note in the report quotes the words
 SIMPLER: Sequence[tuple[str, Callable[[CompactOptions], CompactOptions]]] = (
@@ -56,8 +61,9 @@ SIMPLER: Sequence[tuple[str, Callable[[CompactOptions], CompactOptions]]] = (
 
 @check_arguments
 def compact(
-    scene: Scene | StrPath, options: CompactOptions | None = None, *, progress: Progress | None = None, **settings: Any
-) -> CompactResult:
+    scene: Scene | StrPath, options: CompactOptions | None = None, *, progress: Progress | None = None,
+    **settings: Unpack[CompactSettings],
+) -> CompactResult:  # fmt: skip
     """Replace a scene by a compact one that renders at least as well from new viewpoints.
 
     Args:

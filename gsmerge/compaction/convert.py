@@ -195,7 +195,7 @@ def _clean_joined(
     photos, images, cameras = named_path(options.images), None, None
     if "sky" in drops and (stored is None or photos is None):
         problem = "expected photos and their cameras, which show where the sky is"
-        raise UsageError(f"--drop sky: {problem}; give --set images=FOLDER")
+        raise UsageError(f"--drop sky: {problem}; give --images")
     if stored is not None and photos is not None:
         images = read_images(photos, stored.names)
         cameras = to_cameras(stored, (images.shape[2], images.shape[1]))

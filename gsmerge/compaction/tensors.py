@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -39,6 +39,11 @@ from gsmerge.types import NO_CAMERAS, Cameras, Gaussians, Pixels, Scene
 from gsmerge.values.arrays import Array, as_array, to_float32
 from gsmerge.values.words import count_words
 
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+    from gsmerge.settings.keywords import CompactSettings
+
 TENSOR_ORDERS = ("view-major", "none")
 _REMEDIES = {
     C2W_OPENCV: "pass their inverse, torch.linalg.inv(viewmats)",
@@ -63,7 +68,7 @@ def compact_tensors(
     names: Sequence[str] | None = None,
     order: str = "view-major",
     progress: Progress | None = None,
-    **settings: Any,
+    **settings: Unpack[CompactSettings],
 ) -> CompactResult:
     """Compact Gaussians given as arrays or tensors, as :func:`gsmerge.compact` compacts a scene.
 

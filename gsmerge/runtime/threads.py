@@ -119,6 +119,19 @@ def available_threads() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+@contextmanager
+def default_threads(count: int) -> Iterator[None]:
+    """Set the number of threads that are available in the block, also to processes that it starts."""
+    before = os.environ.get(THREADS)
+    os.environ[THREADS] = str(count)
+    try:
+        yield
+    finally:
+        os.environ.pop(THREADS)
+        if before is not None:
+            os.environ[THREADS] = before
+
+
 def work_alone() -> None:
     """Let the calling thread compute all items of :func:`parallel_map` by itself, as threads of a pool do."""
     _local.inside = True

@@ -29,7 +29,7 @@ class BudgetOptions(Settings):
         "exactly. Upper limits are a share of the input such as 2%, a file size such as 5MB, or a device that draws "
         "them fluidly: quest3, mobile or desktop. auto: as many as the scene needs.",
         "The file size is that of the output, in Python that of a `.ply`, and is never exceeded. A limit is used only "
-        "as far as new views gain from more Gaussians, unless `fill` is true.")  # fmt: skip
+        "as far as new views gain from more Gaussians, unless `fill` is true.", as_text=True)  # fmt: skip
     fill: bool = setting(False, "Use all of a share, file size or device, even if fewer Gaussians suffice.")
     most: int | None = setting(None, "Number of Gaussians beyond which new views gain nothing, if known.",
         internal=True)  # fmt: skip

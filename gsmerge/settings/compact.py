@@ -14,7 +14,7 @@ from gsmerge.runtime.plugins import METHODS, find_plugins
 from gsmerge.settings.budget import AUTO, BudgetOptions
 from gsmerge.settings.fit import FitOptions
 from gsmerge.settings.reading import SCENE_ARGUMENTS
-from gsmerge.settings.setting import Settings, change_settings, flat_settings, setting, settings_of, suggest_name
+from gsmerge.settings.setting import Settings, flat_settings, setting, settings_of, suggest_name
 from gsmerge.settings.stages import (
     BlockOptions,
     CleanOptions,
@@ -186,4 +186,4 @@ class CompactOptions(Settings):
                 hint = f": read_scene(path, {unknown[0]}=...) takes it"
             known = f"; known: {', '.join(sorted(all_settings))}"
             raise ValueError(f"unknown setting {unknown[0]!r}{hint or known}")
-        return change_settings(self, {**RECIPES.get(str(settings.get("recipe")), {}), **settings})
+        return super().with_settings({**RECIPES.get(str(settings.get("recipe")), {}), **settings})

@@ -6,7 +6,9 @@ declarations. This package imports neither NumPy nor torch, so that ``--help`` i
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import Field, dataclass, field, fields, is_dataclass, replace
 from functools import cache
 from inspect import cleandoc
@@ -16,7 +18,7 @@ from operator import ge, gt, le, lt
 from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-T = TypeVar("T")
+T = TypeVar("T", bound="Settings")
 KIND_NAMES = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
 
 
@@ -35,6 +37,7 @@ class Setting:
     unique: bool = False  # true if a list must not repeat a value
     filled: bool = False  # true if a list must have at least one value
     internal: bool = False  # true if only the program sets it
+    as_text: bool = False  # true if a number that a user types stays a text, as reports store it
     name: str = ""  # name of the field
     kind: Any = None  # type of the field
     default: Any = None
@@ -69,25 +72,9 @@ class Setting:
 
     def fits(self, value: Any) -> bool:
         """Return whether a value has one of the types of this setting. Choices and range are not checked."""
-        if self.is_list:
-            return isinstance(value, list | tuple) and all(map(self._fits, value))
-        return self._fits(value)
-
-    def _fits(self, value: Any) -> bool:
-        """Return whether a value, or one element of a list, has one of the types of this setting."""
-        is_bool = type(value).__name__.startswith("bool")  # of Python or NumPy, which is not imported here
-        for kind in _types(self.kind):
-            if get_origin(kind) is Literal:
-                fits = value in get_args(kind)
-            elif kind is bool:
-                fits = is_bool
-            elif kind in (int, float):
-                fits = isinstance(value, Integral if kind is int else Real) and not is_bool
-            else:
-                fits = isinstance(value, kind)
-            if fits:
-                return True
-        return False
+        values = value if self.is_list and isinstance(value, list | tuple) else [value]
+        is_kind = isinstance(value, list | tuple) or not self.is_list
+        return is_kind and all(any(_is_of_kind(one, kind) for kind in _types(self.kind)) for one in values)
 
     def _in_range(self, value: Any) -> bool:
         """Return whether a value of the right type is one of the choices, and in the range."""
@@ -96,6 +83,21 @@ class Setting:
         is_number = isinstance(value, Real)
         limits = ((self.least, ge), (self.most, le), (self.above, gt), (self.below, lt))
         return all(bool(holds(value, limit)) for limit, holds in limits if is_number and limit is not None)
+
+    def parse(self, text: str) -> Any:
+        """Return the value that a typed text stands for: the first of JSON, a number and the text itself that fits."""
+        if self.as_text and text != "null":
+            return text
+        meanings = _list_meanings(text)
+        if self.is_list:
+            meanings.append([_list_meanings(word.strip())[0] for word in text.split(",")])
+        return next(filter(self.fits, meanings), text)
+
+    def read(self, text: str) -> Any:
+        """Return the value that a typed text stands for; ValueError if it is not allowed."""
+        value = self.parse(text)
+        self.check(value)
+        return value
 
     def values(self) -> str:
         """Describe the possible values in a text for messages, such as "a whole number from 1 to 8 or auto"."""
@@ -118,24 +120,17 @@ class Setting:
         """Raise ValueError if a value is not allowed; the message has the possible values."""
         if value is self.default:
             return
-        if not self.is_list:
-            self._check_element(value)
-            return
-        if not isinstance(value, list | tuple):
+        if self.is_list and not isinstance(value, list | tuple):
             raise ValueError(f"{self.name}: expected a list of {self.values()}, got {value!r}")
         if self.filled and not value:
             raise ValueError(f"{self.name}: expected at least one value, got none")
-        for element in value:
-            self._check_element(element)
+        for element in value if self.is_list else [value]:
+            fits = any(_is_of_kind(element, kind) for kind in _types(self.kind))
+            if not (fits and self._in_range(element)):
+                hint = suggest_name(element, self.words)
+                raise ValueError(f"{self.name}: expected {self.values()}, got {element!r}{hint}")
         if self.unique and len(set(value)) < len(value):
             raise ValueError(f"{self.name}: expected every value once, got {','.join(map(str, value))}")
-
-    def _check_element(self, value: Any) -> None:
-        """Raise ValueError if a value, or one element of a list, is not allowed."""
-        if self._fits(value) and self._in_range(value):
-            return
-        hint = suggest_name(value, self.words)
-        raise ValueError(f"{self.name}: expected {self.values()}, got {value!r}{hint}")
 
 
 def setting(default: Any, help: str, more: str = "", **declared: Any) -> Any:
@@ -159,6 +154,16 @@ class Settings:
                 problem = f"{name}: expected {declared.kind.__name__}, got {value!r:.40}"
                 raise ValueError(f"{problem}; {type(self).__name__}().with_settings takes single settings by name")
             declared.check(value)
+
+    def with_settings(self: T, settings: Mapping[str, Any]) -> T:
+        """Return these settings with other values of some, also of settings in groups, by flat name."""
+        changes: dict[str, Any] = {}
+        for name, declared in settings_of(type(self)).items():
+            names = flat_settings(declared.kind) if declared.is_group and not declared.internal else {name}
+            values = {key: settings[key] for key in names if key in settings}
+            if values:
+                changes[name] = getattr(self, name).with_settings(values) if declared.is_group else settings[name]
+        return replace(self, **changes)  # type: ignore[type-var]
 
 
 _declared: dict[type, dict[str, Setting]] = {}  # results of settings_of, which takes time to resolve types
@@ -185,18 +190,6 @@ def flat_settings(options: type) -> dict[str, Setting]:
     return flat
 
 
-def change_settings(options: T, values: Mapping[str, Any]) -> T:
-    """Return ``options`` with new values of some settings, also of settings in groups, by flat name."""
-    changes: dict[str, Any] = {}
-    for name, declared in settings_of(type(options)).items():
-        names = flat_settings(declared.kind) if declared.is_group and not declared.internal else {name}
-        new_values = {key: values[key] for key in names if key in values}
-        if new_values:
-            changes[name] = change_settings(getattr(options, name), new_values) if declared.is_group else values[name]
-    changed: T = replace(options, **changes)  # type: ignore[type-var]
-    return changed
-
-
 def join_words(words: Iterable[str]) -> str:
     """Join words to a text such as "a, b or c"."""
     listed = list(words)
@@ -211,6 +204,25 @@ def suggest_name(word: Any, names: Iterable[Any]) -> str:
     return "".join(
         f"; perhaps {lower_names[nearest]}" for nearest in get_close_matches(str(word).lower(), lower_names, 1)
     )
+
+
+def _list_meanings(text: str) -> list[Any]:
+    """List the possible values of a text, the best first: as JSON, as a number, and as text."""
+    meanings: list[Any] = [text]
+    for parse in (float, json.loads):
+        with suppress(ValueError, RecursionError):
+            meanings.insert(0, parse(text))
+    return meanings
+
+
+def _is_of_kind(value: Any, kind: Any) -> bool:
+    """Return whether a value has a type, or is one of the words of a Literal; neither True nor False is a number."""
+    if get_origin(kind) is Literal:
+        return value in get_args(kind)
+    is_bool = type(value).__name__.startswith("bool")  # of Python or NumPy, which is not imported here
+    if is_bool or kind is bool:
+        return is_bool and kind is bool
+    return isinstance(value, {int: Integral, float: Real}.get(kind, kind))
 
 
 def _types(kind: Any) -> list[Any]:

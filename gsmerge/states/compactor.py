@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from gsmerge.compaction.compact import compact
 from gsmerge.compaction.result import CompactResult
@@ -19,6 +19,11 @@ from gsmerge.states.features import decode_features, extend_features
 from gsmerge.states.state_file import State, load_state, save_state
 from gsmerge.types import Gaussians, Scene, StrPath
 from gsmerge.values.arguments import check_arguments
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+    from gsmerge.settings.keywords import BatchSettings, CompactSettings
 
 
 def extend_state(
@@ -73,14 +78,14 @@ class Compactor:
         200
     """
 
-    def __init__(self, **settings: Any) -> None:
+    def __init__(self, **settings: Unpack[BatchSettings]) -> None:
         batch_settings(settings)
         self._settings = settings
         self._state: State | None = None
 
     @classmethod
     @check_arguments
-    def load(cls, path: StrPath, **settings: Any) -> Compactor:
+    def load(cls, path: StrPath, **settings: Unpack[BatchSettings]) -> Compactor:
         """Load a saved state; ``settings`` apply to further batches.
 
         Raises:
@@ -121,7 +126,7 @@ class Compactor:
         return report
 
     @check_arguments
-    def compact(self, *, progress: Progress | None = None, **settings: Any) -> CompactResult:
+    def compact(self, *, progress: Progress | None = None, **settings: Unpack[CompactSettings]) -> CompactResult:
         """Compact the scene of all batches so far; see :func:`gsmerge.compact`.
 
         Raises:

@@ -209,6 +209,8 @@ def test_every_option_is_a_field_of_the_api() -> None:
         "engine",
         "address",
         "dry-run",
+        "open",
+        "no-open",
         "progress",
         "json",
         "quiet",

@@ -35,7 +35,7 @@ from tiny_scene import (
 )
 
 import gsmerge
-from gsmerge.cli.parameters import parse_pairs
+from gsmerge.cli.parameters import read_settings
 from gsmerge.errors import GsmergeError, SceneError, UsageError
 from gsmerge.io import atomic_outputs, read_cameras, read_gaussians, read_images
 from gsmerge.io.cameras.dataparser import read_dataparser
@@ -47,7 +47,6 @@ from gsmerge.kernels.matrices import invert
 from gsmerge.networks.checkpoint import load_checkpoint
 from gsmerge.scene.read import load_scene
 from gsmerge.settings.compact import CompactOptions
-from gsmerge.settings.setting import flat_settings
 from gsmerge.states.compactor import Compactor
 from gsmerge.states.state_file import load_state
 from gsmerge.types import Gaussians
@@ -211,7 +210,7 @@ def check_pairs(path: Path) -> None:
     """Parse values of ``--set``, one a line."""
     for line in path.read_text("utf-8", "replace").splitlines():
         with suppress(UsageError):
-            parse_pairs("--set", [line], flat_settings(CompactOptions))
+            read_settings((CompactOptions,), [line])
 
 
 # Makers of Gaussians

@@ -198,7 +198,7 @@ def test_crop_and_its_inverse_keep_or_leave_out_a_part(result: Path, tmp_path: P
         convert_files(
             ConvertOptions([result], name_outputs(tmp_path / "d.ply"), clean=CleanOptions(crop="sphere:99,99,99,0.1"))
         )
-    with refuses(UsageError, "--drop sky", "images"):
+    with refuses(UsageError, "--drop sky", "--images"):
         convert_files(ConvertOptions([result], name_outputs(tmp_path / "d.ply"), clean=CleanOptions(drop="sky")))
     assert not (tmp_path / "d.ply").exists()
 

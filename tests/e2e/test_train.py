@@ -93,7 +93,7 @@ def test_photos_beside_the_scene_are_novel_views(scene_copy: Path, floor: Callab
     assert alone.name == f"{scene_copy.name}-scene"
 
 
-@pytest.mark.parametrize(("place", "name", "value"), [("--set steps", "steps", 0), ("width", "width", 50)])
+@pytest.mark.parametrize(("place", "name", "value"), [("--set steps", "steps", 0), ("--set width", "width", 50)])
 def test_wrong_settings_are_refused_in_one_line(
     place: str, name: str, value: int, small_scene: Path, run: Run, tmp_path: Path
 ) -> None:

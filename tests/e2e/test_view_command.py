@@ -17,9 +17,20 @@ def sources(page: Path) -> list[tuple[str, str | None]]:
     return [(one["name"], one["splats"]) for one in data["sources"]]
 
 
-def test_view_replaces_its_own_page_alone(smallest_scene: Path, tmp_path: Path, run: Run) -> None:
+def test_a_named_page_is_replaced_only_if_asked_for(smallest_scene: Path, tmp_path: Path, run: Run) -> None:
     page = tmp_path / "page.html"
     call = ("view", smallest_scene, "--no-open", "-o", page)
+    run(*call, code=0)
+    page.write_text(page.read_text() + "old")
+    assert_refused(run(*call), 2, page, "exists", "--overwrite")
+    run(*call, "--overwrite", code=0)
+    assert page.read_text().endswith("</html>")
+    assert_refused(run(*call[:-1], tmp_path / "page.txt"), 2, tmp_path / "page.txt", ".html")
+
+
+def test_the_page_beside_a_scene_is_replaced_if_gsmerge_made_it(smallest_copy: Path, run: Run) -> None:
+    page = smallest_copy / "scene.view.html"
+    call = ("view", smallest_copy, "--no-open")
     run(*call, code=0)
     page.write_text(page.read_text() + "old")
     run(*call, code=0)
@@ -27,7 +38,6 @@ def test_view_replaces_its_own_page_alone(smallest_scene: Path, tmp_path: Path, 
     page.write_text("<html>mine</html>")
     assert_refused(run(*call), 2, page, "exists")
     assert page.read_text() == "<html>mine</html>"
-    assert_refused(run(*call[:-1], tmp_path / "page.txt"), 2, tmp_path / "page.txt", ".html")
 
 
 @pytest.mark.slow

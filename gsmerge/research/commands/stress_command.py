@@ -1,11 +1,8 @@
 """``gsmerge lab stress``: test a user's own scene under bad conditions."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.before_after import held_out_views, require_views
@@ -28,29 +25,32 @@ class StressFiles(Settings):
     target_images: str | None = setting(None, "Folder of the held-out photos; by default beside their cameras.")
 
 
-@opt.command(
-    opt.SCENE,
-    *opt.panel(opt.MEASURING_GROUP, opt.option("cases", str, "Try only these.", wording="all", metavar="NAME,...")),
-    opt.settings_option(CompactOptions, StressFiles, example="targets=FILE"),
-)
-def stress(args: opt.Args) -> None:
+SETTINGS = (CompactOptions, StressFiles)
+
+
+def stress(
+    scene: opt.Scene,
+    cases: Annotated[str | None, opt.option(opt.MEASURING, "NAME,...", "Try only these.", default="all")] = None,
+    set: Annotated[list[str] | None, opt.settings_option(SETTINGS, example="targets=FILE")] = None,
+    json: opt.Json = False, progress: opt.Progress = None, quiet: opt.Quiet = False,
+) -> None:  # fmt: skip
     """Compact a scene under bad conditions, and report for each condition if the required property holds."""
+    from gsmerge.io.scene_files import find_scene_files
     from gsmerge.measure.documents import document_head, note_entries
     from gsmerge.research.stress import stress as stress_scene
+    from gsmerge.scene.read import load_files
 
-    settings, places = args.make(CompactOptions, StressFiles)
-    paths = {name: None if path is None else Path(path) for name, path in vars(places).items()}
-    # ``args.files`` and ``args.load`` read these attributes, which other commands set by options
-    args.cameras, args.images = (None if p is None else opt.named_or_none(p) for p in (places.cameras, places.images))
-    args.hint = None
-    load = args.load(args.files(args.scene))
+    settings, places = opt.read_settings(SETTINGS, set).make(*SETTINGS)
+    cameras, images = opt.path_or_none(places.cameras), opt.path_or_none(places.images)
+    load = load_files(find_scene_files(scene, cameras=cameras, images=images))
     require_views(load)
-    _, held_out, adapted = held_out_views(load, paths["targets"], paths["target_images"], None)
+    targets, target_images = map(opt.read_path, (places.targets, places.target_images))
+    _, held_out, adapted = held_out_views(load, targets, target_images, None)
     notes = [*load.notes, *adapted]
-    say_notes(notes, quiet=args.silent)
-    names = None if args.cases is None else [name.strip() for name in args.cases.split(",")]
-    with stage_progress(quiet=args.silent) as progress:
-        outcomes = stress_scene(load.scene, settings, targets=held_out, cases=names, progress=progress)
+    say_notes(notes, quiet=quiet or json)
+    names = None if cases is None else [name.strip() for name in cases.split(",")]
+    with stage_progress(quiet=quiet or json) as on_step:
+        outcomes = stress_scene(load.scene, settings, targets=held_out, cases=names, progress=on_step)
     document = {
         **document_head(),
         "input": str(load.files.ply),
@@ -60,13 +60,13 @@ def stress(args: opt.Args) -> None:
         "failed": sum(outcome.held is False for outcome in outcomes),
         **note_entries(notes),
     }
-    print_document(document, _outcome_lines(outcomes), as_json=args.json, quiet=args.quiet)
+    print_document(document, _outcome_lines(outcomes), as_json=json, quiet=quiet)
     failed = [outcome.case for outcome in outcomes if outcome.held is False]
     if failed:
         raise TargetError(f"{len(failed)} of {len(outcomes)} cases failed: {', '.join(failed)}")
 
 
-def _outcome_lines(outcomes: Sequence[StressOutcome]) -> list[str]:
+def _outcome_lines(outcomes: "Sequence[StressOutcome]") -> list[str]:
     """Return the lines of the summary: one for each case, the properties that failed, and the number that held."""
     marks = {True: "held", False: "FAILED", None: "-"}
     width = max((len(outcome.words) for outcome in outcomes), default=0)

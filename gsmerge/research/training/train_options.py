@@ -10,7 +10,7 @@ from typing import Any
 from gsmerge.measure.lpips import require_lpips
 from gsmerge.networks.options import SLOTS, NetworkOptions
 from gsmerge.research.training.loss_ssim import LOSS_WINDOW
-from gsmerge.settings.setting import Settings, change_settings, setting
+from gsmerge.settings.setting import Settings, setting
 from gsmerge.settings.stages import SEGMENTATIONS, MatchMethod, MatchOptions
 
 COUNT_LIMITS: dict[str, Any] = {"least": 1, "most": 10**9}
@@ -214,4 +214,4 @@ def preset_options(name: str) -> TrainOptions:
     """Return the settings of a named preset, or raise ValueError if the name is unknown."""
     if name not in PRESETS:
         raise ValueError(f"preset: expected {' or '.join(PRESETS)}, got {name!r}")
-    return change_settings(TrainOptions(), PRESETS[name])
+    return TrainOptions().with_settings(PRESETS[name])

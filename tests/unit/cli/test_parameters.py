@@ -8,14 +8,13 @@ from typing import Any
 import pytest
 from messages import refuse_all, refuses
 
-from gsmerge.cli.parameters import OPTIONS, Args, parse_pairs
+from gsmerge.cli.parameters import Given, path_or_none, read_settings
 from gsmerge.errors import UsageError
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.evaluate import EvaluateOptions
 from gsmerge.settings.extend import ExtendOptions
-from gsmerge.settings.setting import flat_settings
 
-KNOWN = flat_settings(EvaluateOptions) | flat_settings(CompactOptions)
+KINDS, COMPACT = (EvaluateOptions, CompactOptions), (CompactOptions,)
 
 
 @pytest.mark.parametrize(
@@ -39,7 +38,7 @@ KNOWN = flat_settings(EvaluateOptions) | flat_settings(CompactOptions)
     ],
 )
 def test_values_of_set_are_read_as_json_or_text(pair: str, expected: dict[str, Any]) -> None:
-    assert parse_pairs("--set", [pair], KNOWN) == expected
+    assert read_settings(KINDS, [pair]).values == expected
 
 
 @pytest.mark.parametrize(
@@ -54,43 +53,48 @@ def test_values_of_set_are_read_as_json_or_text(pair: str, expected: dict[str, A
 )  # fmt: skip
 def test_impossible_pairs_of_set_are_refused(pairs: list[str], place: str, found: list[str]) -> None:
     with refuses(UsageError, place, *found):
-        parse_pairs("--set", pairs, KNOWN)
+        read_settings(KINDS, pairs).make(*KINDS)
 
 
 def test_settings_come_from_options_and_set_together() -> None:
-    args = Args(k=2, effort="fast", set=["overlap=0.5"])
-    settings = args.settings()
+    (settings,) = read_settings(COMPACT, ["overlap=0.5"], k="2", effort="fast", fit=None).make(*COMPACT)
     assert (settings.decode.k, settings.effort, settings.match.overlap) == (2, "fast", 0.5)
     refuse_all(UsageError, [
-        (Args(k=2, set=["k=3"]).settings, "--set k", "--k"), (Args(set=["iou=2"]).settings, "--set iou", "0 to 1", 2),
-        (lambda: Args(set=["fit=full"]).settings(fit="none"), "--set fit", "unknown", "--set help"),
+        (lambda: read_settings(COMPACT, ["k=3"], k="2"), "--set k", "--k"),
+        (lambda: read_settings(COMPACT, ["iou=2"]).make(*COMPACT), "--set iou", "0 to 1", 2),
+        (lambda: read_settings(COMPACT, k="9").make(*COMPACT), "--k", "1 to 8", 9),
     ])  # fmt: skip
 
 
-def test_words_of_options_become_values() -> None:
+def test_texts_of_options_become_values() -> None:
     """A budget stays a text: batches compare it with that of finished results."""
-    words = {"budget": "300", "k": "2", "seed": "3", "effort": "fast", "cameras": "none", "images": "a/b"}
-    values = {name: OPTIONS[name].read(word, ()) for name, word in words.items()}
-    assert values == {"budget": "300", "k": 2, "seed": 3, "effort": "fast", "cameras": "none", "images": Path("a/b")}
+    texts = {"budget": "300", "k": "2", "seed": "3", "effort": "fast"}
+    assert read_settings(COMPACT, **texts).values == {"budget": "300", "k": 2, "seed": 3, "effort": "fast"}
+    assert (path_or_none("none"), path_or_none("./none"), path_or_none(None)) == ("none", Path("none"), None)
 
 
 def test_set_fills_several_kinds_of_settings() -> None:
-    assert Args(set=["k=2", "max_views=3"]).values(CompactOptions, ExtendOptions) == {"k": 2, "max_views": 3}
-    made, online = Args(set=["recipe=paper", "max_views=3"]).make(CompactOptions, ExtendOptions)
+    kinds = (CompactOptions, ExtendOptions)
+    given = read_settings(kinds, ["recipe=paper", "max_views=3"])
+    assert given.values == {"recipe": "paper", "max_views": 3}
+    made, online = given.make(*kinds)
     assert (made.segment.segmentation, online.max_views) == ("bass-st", 3)
 
 
 def test_the_seed_may_come_from_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    def seed_of(given: Given) -> int:
+        return int(given.make(*COMPACT)[0].seed)
+
     monkeypatch.setenv("GSMERGE_SEED", "7")
-    assert Args().settings().seed == 7
-    assert Args(seed=3).settings().seed == Args(set=["seed=3"]).settings().seed == 3
+    assert seed_of(read_settings(COMPACT)) == 7
+    assert seed_of(read_settings(COMPACT, seed="3")) == seed_of(read_settings(COMPACT, ["seed=3"])) == 3
     monkeypatch.setenv("GSMERGE_SEED", "many")
     with refuses(UsageError, "GSMERGE_SEED", "'many'"):
-        Args().settings()
+        seed_of(read_settings(COMPACT))
 
 
 def test_an_unknown_setting_is_refused_with_a_near_name() -> None:
     with refuses(UsageError, "--set superpixel", "superpixels"):
-        parse_pairs("--set", ["superpixel=3"], KNOWN)
+        read_settings(KINDS, ["superpixel=3"])
     with refuses(UsageError, "--set foo", "unknown; --set help"):
-        parse_pairs("--set", ["foo=1"], flat_settings(CompactOptions))
+        read_settings(COMPACT, ["foo=1"])

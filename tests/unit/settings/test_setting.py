@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from gsmerge import CompactOptions
-from gsmerge.cli.parameters import OPTIONS, SETTINGS
+from gsmerge.settings.evaluate import EvaluateOptions
+from gsmerge.settings.placement import PlacementOptions
 from gsmerge.settings.setting import Settings, flat_settings, setting, settings_of
 
 
@@ -88,11 +89,7 @@ def test_help_has_the_text_of_each_field() -> None:
 
 
 def test_every_default_is_possible() -> None:
-    for name, declared in (flat_settings(CompactOptions) | SETTINGS).items():
+    for name, declared in (
+        flat_settings(CompactOptions) | flat_settings(EvaluateOptions) | flat_settings(PlacementOptions)
+    ).items():
         assert declared.fits(declared.default), name
-
-
-def test_options_leave_their_defaults_to_the_library() -> None:
-    named = [OPTIONS[name] for name in OPTIONS if name in SETTINGS and name not in ("engine", "lpips")]
-    assert len(named) > 12
-    assert {parameter.default for parameter in named} <= {None, False}

@@ -18,7 +18,6 @@ from gsmerge.networks.corrections import LOGIT_COLUMN
 from gsmerge.networks.options import Bounds
 from gsmerge.research.training import Shard, TrainOptions, make_example, preset_options, train
 from gsmerge.research.training.scenes import make_training_scene
-from gsmerge.settings.setting import change_settings
 
 
 class StoppedError(Exception):
@@ -125,7 +124,7 @@ def test_paper_preset_has_the_paper_s_values() -> None:
     assert (paper.rate_at(1999), paper.clip) == (5e-5, 10)
     assert paper.rate_at(299_999) == pytest.approx(1e-6, rel=1e-3)
     network = replace(paper.network, width=16, bounds=Bounds(mean=0.5))
-    assert change_settings(paper, {"steps": 10, "width": 16, "mean": 0.5}) == replace(paper, steps=10, network=network)
+    assert paper.with_settings({"steps": 10, "width": 16, "mean": 0.5}) == replace(paper, steps=10, network=network)
     assert paper.photo_level(952, 100) == 2
     assert paper.photo_level(320, 240) == 1
 
