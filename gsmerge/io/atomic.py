@@ -19,7 +19,7 @@ import stat
 import sys
 import time
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import cache, reduce
@@ -79,7 +79,13 @@ def atomic_outputs(*, overwrite: bool = False, mode: int = 0o666) -> Iterator[Ad
             raise
         raise error_for_caller from error
     finally:
-        outputs.remove_rest()
+        for temporary in outputs.paths:  # temporary files that were not renamed
+            with suppress(OSError):
+                os.unlink(temporary)
+        for folder in reversed(outputs.new_folders):
+            with suppress(OSError):  # of a folder with files
+                os.rmdir(folder)
+        _written.difference_update(outputs.paths)
 
 
 @dataclass(frozen=True)
@@ -93,11 +99,37 @@ class _Outputs:
     new_folders: list[Path] = field(default_factory=list)  # parents before their children
 
     def add(self, path: Path) -> Path:
-        """Make the temporary file of an output, and return its path."""
+        """Make the temporary file of an output, and return its path.
+
+        Raise SceneError if the output cannot be written, or if it exists and ``overwrite`` is False.
+        """
         if str(path) in _written:  # the path is a temporary file itself
             return path
-        self.new_folders.extend(_make_folder(path.parent))
-        _check_output_is_free(path, self.overwrite)
+        missing = list(takewhile(lambda folder: not os.path.lexists(folder), path.parents))
+        for folder in reversed(missing):
+            try:
+                os.mkdir(folder)
+                self.new_folders.append(folder)
+            except FileExistsError:  # another process made it meanwhile
+                pass
+            except OSError as error:
+                raise SceneError(folder, f"cannot be made ({error.strerror})", "choose another folder") from error
+        try:
+            status = os.stat(path)
+        except FileNotFoundError:
+            status = None
+        except (OSError, ValueError) as error:
+            reason = getattr(error, "strerror", None) or error
+            raise SceneError(path, f"cannot be written ({reason})", "choose another name") from error
+        if status is not None and stat.S_ISDIR(status.st_mode):
+            raise SceneError(path, "expected a file to write, found a folder", "name a file in it")
+        if status is not None and not stat.S_ISREG(status.st_mode):
+            raise SceneError(path, "expected a file to write, found a pipe or a device", "name a file")
+        if not os.path.isdir(path.parent):
+            problem = f"expected a folder to write to, found the file {path.parent}"
+            raise SceneError(path, problem, "choose another folder")
+        if os.path.lexists(path) and not self.overwrite:
+            raise SceneError(path, describe_existing(path), _EXISTS[1])
         target = Path(os.path.realpath(path)) if path.is_symlink() else path
         _remove_stale_once(target.parent.absolute())
         temporary = temporary_path(target)
@@ -112,7 +144,11 @@ class _Outputs:
         return temporary
 
     def rename(self) -> None:
-        """Wait until all files are on the disk, and rename them, files in the deepest folders first."""
+        """Wait until all files are on the disk, and rename them, folder by folder, the deepest folders first.
+
+        Without ``overwrite``, all renamed files are removed again if another process has meanwhile made a file with one
+        of the final names.
+        """
         for temporary, (_, target) in self.paths.items():
             _flush(temporary)
             if sys.platform != "win32" and os.path.exists(target):
@@ -123,7 +159,17 @@ class _Outputs:
             (-len(path.parts), target.parent, temporary, target) for temporary, (path, target) in self.paths.items()
         ]
         files.sort(key=lambda file: file[:2])  # by depth and folder
-        _rename_all([(temporary, target) for *_, temporary, target in files], overwrite=self.overwrite)
+        renamed = list[Path]()
+        try:
+            for folder, group in groupby(files, lambda file: file[1]):
+                for *_, temporary, target in group:
+                    (os.replace if self.overwrite else _rename_to_new)(temporary, target)
+                    renamed.append(target)
+                _flush_names(folder)
+        except FileExistsError as error:  # another process has meanwhile made a file with one of the final names
+            for path in renamed:
+                os.unlink(path)
+            raise SceneError(error.filename, *_EXISTS) from error
 
     def name_error(self, error: SceneError | OSError) -> SceneError | None:
         """Convert an error about a temporary file to an error about the caller's path; None for any other error."""
@@ -136,29 +182,6 @@ class _Outputs:
         path, _ = self.paths.get(str(error.filename), next(iter(self.paths.values())))
         remedy = "close what has it open" if sys.platform == "win32" and isinstance(error, PermissionError) else ""
         return SceneError(path, f"could not be written ({error.strerror})", remedy)
-
-    def remove_rest(self) -> None:
-        """Remove the temporary files that were not renamed, and the folders that this call made if they are empty."""
-        for temporary in self.paths:
-            with suppress(OSError):
-                os.unlink(temporary)
-        for folder in reversed(self.new_folders):
-            with suppress(OSError):  # of a folder with files
-                os.rmdir(folder)
-        _written.difference_update(self.paths)
-
-
-def _make_folder(folder: Path) -> Iterator[Path]:
-    """Make a folder and its parents, and yield each folder that was missing, parents first."""
-    missing = list(takewhile(lambda path: not os.path.lexists(path), (folder, *folder.parents)))
-    for path in reversed(missing):
-        try:
-            os.mkdir(path)
-            yield path
-        except FileExistsError:  # another process made it meanwhile
-            pass
-        except OSError as error:
-            raise SceneError(path, f"cannot be made ({error.strerror})", "choose another folder") from error
 
 
 def common_mode(paths: Iterable[Path]) -> int:
@@ -185,29 +208,10 @@ def _copy_rights(source: Path, path: str) -> None:
         os.chmod(path, mode if has_group else mode & (0o707 | (mode & 0o007) << 3))
 
 
-def _rename_all(files: Sequence[tuple[str, Path]], *, overwrite: bool) -> None:
-    """Rename each temporary file to its final name, folder by folder.
-
-    Without ``overwrite``, all renamed files are removed again if another process has meanwhile made a file with one of
-    the final names.
-    """
-    renamed = list[Path]()
-    try:
-        for folder, group in groupby(files, lambda file: file[1].parent):
-            for temporary, target in group:
-                (os.replace if overwrite else _rename_to_new)(temporary, target)
-                renamed.append(target)
-            _flush_names(folder)
-    except FileExistsError as error:
-        for path in renamed:
-            os.unlink(path)
-        raise SceneError(error.filename, *_EXISTS) from error
-
-
 def _rename_to_new(temporary: str, target: Path) -> None:
     """Rename a file; raise FileExistsError if a file has the new name, even if another process makes it meanwhile.
 
-    The temporary name may stay as a second name of the file, until :meth:`_Outputs.remove_rest` removes it.
+    The temporary name may stay as a second name of the file, until :func:`atomic_outputs` removes it.
     """
     try:
         (os.rename if sys.platform == "win32" else os.link)(temporary, target)  # both fail if the name exists
@@ -292,25 +296,6 @@ def _is_stale(entry: os.DirEntry[str], machine: str, pid: int) -> bool:
         return status.rpartition(b") ")[2][:1] in (b"Z", b"X")
     except OSError:
         return False
-
-
-def _check_output_is_free(path: Path, overwrite: bool) -> None:
-    """Raise SceneError if an output cannot be written, or if the output exists and ``overwrite`` is False."""
-    try:
-        status = os.stat(path)
-    except FileNotFoundError:
-        status = None
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise SceneError(path, f"cannot be written ({reason})", "choose another name") from error
-    if status is not None and stat.S_ISDIR(status.st_mode):
-        raise SceneError(path, "expected a file to write, found a folder", "name a file in it")
-    if status is not None and not stat.S_ISREG(status.st_mode):
-        raise SceneError(path, "expected a file to write, found a pipe or a device", "name a file")
-    if not os.path.isdir(path.parent):
-        raise SceneError(path, f"expected a folder to write to, found the file {path.parent}", "choose another folder")
-    if os.path.lexists(path) and not overwrite:
-        raise SceneError(path, describe_existing(path), _EXISTS[1])
 
 
 def describe_existing(path: Path) -> str:

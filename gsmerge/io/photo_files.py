@@ -5,7 +5,8 @@ from __future__ import annotations
 import io
 import struct
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
@@ -163,10 +164,7 @@ def decode_small(path: Path, side: int) -> np.ndarray:
     """
     width, height = image_size(path)
     divisor = next(divisor for divisor in reversed(_REDUCTIONS) if max(width, height) >= divisor * side or divisor == 1)
-    with read_errors(path):
-        data = np.fromfile(path, np.uint8)
-    _check_scans(path, data, (width, height))
-    photo = _decode(path, data, (width, height), divisor if data[:2].tobytes() == _JPEG else 1)
+    photo = decode_image(path, (width, height), divisor)
     ratio = max(photo.shape[:2]) / (2 * side)
     if ratio > 1:
         small_size = max(1, round(photo.shape[1] / ratio)), max(1, round(photo.shape[0] / ratio))
@@ -191,12 +189,31 @@ def keep_photos(photos: PhotoArrays) -> PhotoArrays:
     return parallel_map(photos.read, range(len(photos))) if isinstance(photos, PhotoReader) else photos
 
 
-def decode_image(path: Path, size: Size) -> np.ndarray:
-    """Decode an image file of known ``size`` to ``[h,w,3]`` uint8 sRGB; raise SceneError if it cannot be read."""
+def decode_image(path: Path, size: Size, divisor: int = 1) -> np.ndarray:
+    """Decode an image file of known ``size`` to ``[h,w,3]`` uint8 sRGB; raise SceneError if it cannot be read.
+
+    The orientation tag is ignored. If the file is a JPEG, each side is divided by ``divisor``. Also raise SceneError if
+    the scans of a JPEG take longer than its bytes allow; each scan covers all pixels.
+    """
     with read_errors(path):
         data = np.fromfile(path, np.uint8)
-    _check_scans(path, data, size)
-    return _decode(path, data, size)
+    is_jpeg = data[:2].tobytes() == _JPEG
+    num_scans, divisor = (data.tobytes().count(_SCAN), divisor) if is_jpeg else (0, 1)
+    pixels_per_step = 50_000  # pixels of an empty scan that are decoded in one step of a budget
+    steps = num_scans * size[0] * size[1] // pixels_per_step
+    ReadBudget(path, len(data)).check_steps(steps, f"steps of decoding {num_scans:,} scans")
+    width, height = (-(-side // divisor) for side in size)
+    pixels = _png_pixels(data) if data[: len(PNG)].tobytes() == PNG else data
+    image = None
+    with suppress(cv2.error):
+        if pixels is not None and len(pixels):
+            image = cv2.imdecode(pixels, _REDUCTIONS[divisor] | cv2.IMREAD_IGNORE_ORIENTATION)
+    if image is None:
+        raise _undecodable(path, size)
+    if image.shape != (height, width, 3):
+        problem = f"expected {width} x {height} pixels, as its header says, found another size"
+        raise SceneError(path, problem, "replace it")
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=image)
 
 
 def as_floats(images: PhotoArrays) -> np.ndarray:
@@ -250,23 +267,18 @@ def decode_levels(path: Path, photo: Path | None = None) -> np.ndarray:
     very few bytes.
     """
     budget = _photo_budget(path, *([] if photo is None else [photo]))
-
-    def brightness(image: Image.Image) -> np.ndarray:
-        """Return the brightness ``[h,w]`` that the file stores; in 8-bit images, brightness times opacity."""
+    with _open_pixels(path) as image:
         _check_pillow_memory(budget, image)
         if image.mode[0] in "IF":  # more than 8 bits
-            return np.asarray(image)
-        grey = np.empty(image.size[::-1], np.uint8)
-        for top in range(0, image.height, _BAND):  # copies of a band take little memory
-            band = image.crop((0, top, image.width, min(top + _BAND, image.height)))
-            rows = grey[top : top + _BAND]
-            rows[:] = band.convert("L")
-            if "A" in image.getbands():
-                rows[:] = np.round(rows * np.asarray(band.getchannel("A"), np.float32) / 255)
-        return grey
-
-    grey = _decode_channel(path, brightness)
-    assert grey is not None
+            grey = np.asarray(image)
+        else:
+            grey = np.empty(image.size[::-1], np.uint8)
+            for top in range(0, image.height, _BAND):  # copies of a band take little memory
+                band = image.crop((0, top, image.width, min(top + _BAND, image.height)))
+                rows = grey[top : top + _BAND]
+                rows[:] = band.convert("L")
+                if "A" in image.getbands():
+                    rows[:] = np.round(rows * np.asarray(band.getchannel("A"), np.float32) / 255)
     brightest = float(grey.max(initial=0))
     whites = 1, 255, 65535  # of fractions or of 0 and 1, of 8 bits, and of 16 bits
     white = next(
@@ -276,8 +288,8 @@ def decode_levels(path: Path, photo: Path | None = None) -> np.ndarray:
         return grey
     levels = np.zeros(grey.shape, np.uint8)
     for top in range(0, len(grey), _BAND):
-        rows = slice(top, top + _BAND)
-        levels[rows] = np.round(np.clip(grey[rows] * (255 / white), 0, 255))
+        block = slice(top, top + _BAND)
+        levels[block] = np.round(np.clip(grey[block] * (255 / white), 0, 255))
     return levels
 
 
@@ -285,17 +297,13 @@ def decode_alpha(path: Path) -> np.ndarray | None:
     """Decode where a photo is opaque: ``[h,w]`` bool, True for opaque pixels; None if the whole photo is opaque."""
     if path.suffix.lower() in _OPAQUE_SUFFIXES:
         return None
-
-    def alpha(image: Image.Image) -> Image.Image | None:
-        """Return the opacities of an image; None if the image has no opacities."""
+    with _open_pixels(path) as image:
         if "A" not in image.getbands() and "transparency" not in image.info:
             return None
         _check_pillow_memory(_photo_budget(path), image)
-        return image.convert("RGBA").getchannel("A")
-
-    values = _decode_channel(path, alpha)
+        values = np.asarray(image.convert("RGBA").getchannel("A"))
     half_opaque = 127  # of 255; pixels with a higher value are opaque
-    return None if values is None or values.min() > half_opaque else values > half_opaque
+    return None if values.min() > half_opaque else values > half_opaque
 
 
 def _photo_budget(path: Path, *beside: Path) -> ReadBudget:
@@ -323,12 +331,10 @@ def _decoder_bytes(image: Image.Image) -> float:
     return _COEFFICIENT_BYTES * sum(densities) / max(densities, default=1)
 
 
-def _decode_channel(path: Path, choose: Callable[[Image.Image], Image.Image | np.ndarray | None]) -> np.ndarray | None:
-    """Open an image with Pillow, and return the channel that ``choose`` returns as an array; None if it returns None.
-
-    Raise SceneError if the image cannot be decoded.
-    """
-    size, _ = _read_header(path)  # raises SceneError for a file that is no image or is too large
+@contextmanager
+def _open_pixels(path: Path) -> Iterator[Image.Image]:
+    """In a ``with`` block, yield an image that Pillow opened; raise SceneError if its pixels cannot be decoded."""
+    size = image_size(path, limits_memory=False)  # raises SceneError for a file that is no image or is too large
     try:
         with quiet_warnings():
             data = np.fromfile(path, np.uint8)
@@ -336,52 +342,60 @@ def _decode_channel(path: Path, choose: Callable[[Image.Image], Image.Image | np
             if pixels is None:
                 raise ValueError("damaged chunks")
             with _open_image(io.BytesIO(pixels.data), ("PNG", *_FORMATS)) as image:
-                channel = choose(image)
-                return None if channel is None else np.asarray(channel)
+                yield image
     except (SceneError, MemoryError):
         raise
     except Exception as error:  # damage may make the library raise any error
         raise _undecodable(path, size) from error
 
 
-def _undecodable(path: Path, size: Size) -> SceneError:
-    """Make the error for an image that a library did not decode; raise MemoryError if memory was the reason."""
+def _undecodable(path: Path, size: Size = (0, 0)) -> SceneError:
+    """Make the error for a file that is no image, or that a library did not decode to its ``size``.
+
+    Raise MemoryError if memory was the reason, and a SceneError for a picture of a known format.
+    """
     work_bytes = 9  # additional bytes of a pixel while a library decodes it
     np.empty((_CHANNELS + work_bytes, *size), np.uint8)  # raises MemoryError, since the library does not say so
-    return _unreadable(path)
-
-
-def _unreadable(path: Path) -> SceneError:
-    """Make the error for a file that is no image; raise a SceneError for a picture of a known format."""
     refuse_picture(path)
     return SceneError(path, "expected an image, found a file that cannot be decoded", "replace it")
 
 
-def image_size(path: Path) -> Size:
+def image_size(path: Path, *, limits_memory: bool = True) -> Size:
     """Read (width, height) from the header of a PNG, JPEG, WebP, BMP or PNM file; the orientation tag is ignored.
 
-    Raise SceneError if the file has another format or cannot be read, if the size is impossible, or if the pixels take
-    more memory than the file allows.
+    Raise SceneError if the file has another format or cannot be read, if the size is impossible, or if the file has far
+    more bytes than its pixels need. With ``limits_memory``, also raise SceneError if the pixels take more memory than
+    the file allows.
     """
-    (width, height), pixel_bytes = _read_header(path)
-    _photo_budget(path).check_memory(pixel_bytes * width * height, f"{width} x {height} pixels")
-    return width, height
-
-
-def _read_header(path: Path) -> tuple[Size, float]:
-    """Return the size of an image, and how many bytes of memory a decoder needs for each pixel.
-
-    Raise SceneError if the file is no image, or has far more bytes than its pixels need.
-    """
-    num_bytes = check_file(path)
+    num_bytes, work_bytes = check_file(path), 0.0
     with read_errors(path), path.open("rb") as file:
-        (width, height), pixel_bytes = _parse_header(path, file)
+        start = file.read(24)
+        file.seek(0)
+        try:
+            if start[:8] == PNG:  # Pillow would also refuse a PNG with damage outside its pixels
+                width, height = struct.unpack(">II", start[16:24])
+            else:
+                with quiet_warnings():
+                    image = _open_image(file, _FORMATS)
+                work_bytes = _decoder_bytes(image)
+                width, height = image.size
+        except (SceneError, MemoryError):
+            raise
+        except Image.DecompressionBombError as error:
+            problem = f"expected at most {MAX_PIXELS // 1_000_000} million pixels per image, found more"
+            raise SceneError(path, problem, "reduce its size") from error
+        except Exception as error:  # a damaged header may make the library raise any error
+            raise _undecodable(path) from error
+    check_image_size(path, width, height)
     max_pixel_bytes, max_extra = 16, 16 << 20  # most bytes of a pixel, four floats, and of profiles and thumbnails
     if num_bytes > max_pixel_bytes * width * height + max_extra:
         limit = f"{max_pixel_bytes} bytes per pixel and {max_extra >> 20} MiB"
         found = f"{num_bytes >> 20} MiB for {width} x {height} pixels"
         raise SceneError(path, f"expected at most {limit}, found {found}", "save the image again")
-    return (width, height), pixel_bytes
+    if limits_memory:
+        pixel_bytes = max(_COPIES[0] * _CHANNELS, _CHANNELS + work_bytes)  # bytes that a decoder needs for each pixel
+        _photo_budget(path).check_memory(pixel_bytes * width * height, f"{width} x {height} pixels")
+    return width, height
 
 
 def orientation_turn(path: Path) -> int:
@@ -395,29 +409,6 @@ def orientation_turn(path: Path) -> int:
             return 0
 
 
-def _parse_header(path: Path, file: BinaryIO) -> tuple[Size, float]:
-    """Read an image's header; return the size, and how many bytes of memory a decoder needs for each pixel."""
-    start, work_bytes = file.read(24), 0.0
-    file.seek(0)
-    try:
-        if start[:8] == PNG:  # Pillow would also refuse a PNG with damage outside its pixels
-            width, height = struct.unpack(">II", start[16:24])
-        else:
-            with quiet_warnings():
-                image = _open_image(file, _FORMATS)
-            work_bytes = _decoder_bytes(image)
-            width, height = image.size
-    except (SceneError, MemoryError):
-        raise
-    except Image.DecompressionBombError as error:
-        problem = f"expected at most {MAX_PIXELS // 1_000_000} million pixels per image, found more"
-        raise SceneError(path, problem, "reduce its size") from error
-    except Exception as error:  # a damaged header may make the library raise any error
-        raise _unreadable(path) from error
-    check_image_size(path, width, height)
-    return (width, height), max(_COPIES[0] * _CHANNELS, _CHANNELS + work_bytes)
-
-
 def _open_image(file: BinaryIO, formats: Sequence[str]) -> Image.Image:
     """Open an image in one of Pillow's ``formats``, as ``Image.open`` does, with the same errors.
 
@@ -429,34 +420,6 @@ def _open_image(file: BinaryIO, formats: Sequence[str]) -> Image.Image:
         import_module(f"PIL.{plugin}ImagePlugin")
         formats = (plugin.upper(),)
     return Image.open(file, formats=tuple(formats))
-
-
-def _check_scans(path: Path, data: np.ndarray, size: Size) -> None:
-    """Raise SceneError if the scans of a JPEG file take longer than its bytes allow; each scan covers all pixels."""
-    num_scans = data.tobytes().count(_SCAN) if data[:2].tobytes() == _JPEG else 0
-    pixels_per_step = 50_000  # pixels of an empty scan that are decoded in one step of a budget
-    steps = num_scans * size[0] * size[1] // pixels_per_step
-    ReadBudget(path, len(data)).check_steps(steps, f"steps of decoding {num_scans:,} scans")
-
-
-def _decode(path: Path, data: np.ndarray, size: Size, divisor: int = 1) -> np.ndarray:
-    """Decode the bytes of a file to ``[h,w,3]`` uint8 sRGB, with each side divided by ``divisor``.
-
-    The orientation tag is ignored.
-    """
-    width, height = (-(-side // divisor) for side in size)
-    flags = _REDUCTIONS[divisor] | cv2.IMREAD_IGNORE_ORIENTATION
-    pixels = _png_pixels(data) if data[: len(PNG)].tobytes() == PNG else data
-    try:
-        image = cv2.imdecode(pixels, flags) if pixels is not None and len(pixels) else None
-    except cv2.error:
-        image = None
-    if image is None:
-        raise _undecodable(path, size)
-    if image.shape != (height, width, 3):
-        problem = f"expected {width} x {height} pixels, as its header says, found another size"
-        raise SceneError(path, problem, "replace it")
-    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=image)
 
 
 def _png_pixels(data: np.ndarray) -> np.ndarray | None:

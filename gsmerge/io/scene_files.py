@@ -26,7 +26,7 @@ from gsmerge.io.cameras.read import (
 )
 from gsmerge.io.cameras.table import is_colmap
 from gsmerge.io.cameras.viewer_cameras import viewer_cameras_path
-from gsmerge.io.formats.ply import header_content, header_counts, is_file_from_gsmerge
+from gsmerge.io.formats.ply import header_content, header_counts, is_from_gsmerge, read_header
 from gsmerge.io.formats.table import (
     META,
     OUTPUT_FORMATS,
@@ -285,8 +285,20 @@ def _find_camera_paths(ply: Path, roots: Sequence[Path]) -> tuple[Path | None, l
 
 
 def _find_pictures(option: str, places: Sequence[str], roots: Sequence[Path], ply: Path) -> Path | None:
-    """Find the first of the ``places`` in ``roots`` that has pictures, but no pictures of another scene; or None."""
-    folders = [(root, f) for root in roots for place in places if can_be_listed(f := root / place, option)]
+    """Find the first of the ``places`` in ``roots`` that has pictures, but no pictures of another scene; or None.
+
+    Raise SceneError, with a remedy by ``option``, if a place is a folder that cannot be read.
+    """
+    folders = list[tuple[Path, Path]]()
+    for root, folder in ((root, root / place) for root in roots for place in places):
+        try:
+            os.scandir(folder).close()
+        except (FileNotFoundError, NotADirectoryError):
+            continue
+        except OSError as error:
+            remedy = f"make it readable, name another folder with --{option}, or say --{option} none"
+            raise SceneError(folder, f"cannot be read ({error.strerror})", remedy) from error
+        folders.append((root, folder))
     # If a folder has several scenes, each may have its own folder of pictures, with the name of the scene
     names = ply.stem, os.path.basename(os.path.realpath(ply.parent))
     for root, folder in [*((root, folder / name) for root, folder in folders for name in names), *folders]:
@@ -305,18 +317,6 @@ def _is_in_other_scene(path: Path, root: Path, ply: Path) -> bool:
     folders = [place for place in (path, *path.parents) if place != root and place.is_relative_to(root)]
     scenes = [_plys_in(place) or other_plys(place / SCENES_PLACE) for place in folders if place.is_dir()]
     return any(plys and os.path.realpath(ply) not in map(os.path.realpath, plys) for plys in scenes)
-
-
-def can_be_listed(folder: Path, option: str) -> bool:
-    """Return whether a path is a folder; raise SceneError, with a remedy by ``option``, if it cannot be read."""
-    try:
-        os.scandir(folder).close()
-    except (FileNotFoundError, NotADirectoryError):
-        return False
-    except OSError as error:
-        remedy = f"make it readable, name another folder with --{option}, or say --{option} none"
-        raise SceneError(folder, f"cannot be read ({error.strerror})", remedy) from error
-    return True
 
 
 def _find_above(files: SceneFiles, roots: Sequence[Path]) -> tuple[tuple[str, Path], ...]:
@@ -391,7 +391,7 @@ def _rate_camera_file(ply: Path) -> int:
     if find_format(ply).ending != ".ply" or header_content(ply) == "result":
         return 2
     namesakes = (ply.with_suffix(ending) for ending in OUTPUT_FORMATS if ending != ".ply")
-    return is_file_from_gsmerge(ply) + (not any(path.is_file() for path in namesakes))
+    return is_from_gsmerge(read_header(ply).comments) + (not any(path.is_file() for path in namesakes))
 
 
 def named_path(path: StrPath | None) -> Path | None:

@@ -27,7 +27,7 @@ from gsmerge.runtime import MOST_THREADS
 THREADS = "GSMERGE_THREADS"  # environment variable with the default number of threads
 T = TypeVar("T")
 R = TypeVar("R")
-LIBRARIES = r"(PIL|plyfile|numpy|gsmerge\.io)\b"  # modules that warn of damaged files, which readers report themselves
+LIBRARIES = r"(PIL|numpy|gsmerge\.io)\b"  # modules that warn of damaged files, which readers report themselves
 AT_ONCE = 12  # most results of in_turn that are in memory at the same time
 
 

@@ -149,13 +149,18 @@ def make_camera_file(
         views = [view._replace(K=make_pinhole(f, f, 0, 0)) for view, f in zip(views, focals, strict=True)]
     poses, Ks = np.tile(np.eye(4), (len(views), 1, 1)), np.array([view.K for view in views], np.float64)
     for i, view in enumerate(views):
-        poses[i, :3] = _check_pose(path, view)
+        poses[i, :3] = _check_view(path, view)[:3]
         check_camera(path, view.name, poses[i], Ks[i])
-        _check_lens(path, view)
     for w, h in (view.size for view in views):
         if not (0 <= w <= _MAX_SIDE and 0 <= h <= _MAX_SIDE):
             raise SceneError(path, f"expected a positive image size, found {w:.6g} x {h:.6g}")
-    Ks, sizes = _in_pixels(Ks, [view.size for view in views])
+    sizes = [view.size for view in views]
+    is_relative = (Ks[:, 0, 0] < MAX_NORMALISED_FOCAL) & (Ks[:, 1, 1] < MAX_NORMALISED_FOCAL)
+    is_relative &= (np.abs(Ks[:, :2, 2] - 0.5) < 1).all(1)
+    # If an image has only a few pixels, small focal lengths may be in pixels, too
+    if is_relative.all() and not any(0 < min(size) <= MAX_NORMALISED_FOCAL for size in sizes):
+        sizes = [size if min(size) > 0 else (1, 1) for size in sizes]  # an unknown size becomes 1 x 1
+        Ks = Ks * np.array([(w, h, 1) for w, h in sizes], np.float64)[:, :, None]
     for view, K, size in zip(views, Ks, sizes, strict=True):
         check_size(path, view.name, K, size)
     lenses = tuple(view.lens for view in views)
@@ -176,24 +181,19 @@ def make_camera_file(
     )
 
 
-def _check_pose(path: StrPath, view: StoredView) -> np.ndarray:
-    """Return the first three rows ``[3,4]`` of a view's pose; raise SceneError unless the pose is 3x4 or 4x4."""
+def _check_view(path: StrPath, view: StoredView) -> np.ndarray:
+    """Return a view's pose; raise SceneError unless it is 3x4 or 4x4, or if a lens coefficient is far too large."""
     pose = np.asarray(view.pose, np.float64)
     if pose.shape not in ((3, 4), (4, 4)):
         raise SceneError(path, f"view {view.name}: expected a pose of 3x4 or 4x4 numbers, found {pose.shape}")
-    return pose[:3]
-
-
-def _check_lens(path: StrPath, view: StoredView) -> None:
-    """Raise SceneError if a coefficient of a view's lens is far too large."""
-    if view.lens is None:
-        return
     max_coefficient = 1e6  # smaller coefficients are checked by their effect, when photos are undistorted
-    for name, coefficient in zip(COEFFICIENTS[view.lens.model], view.lens.coefficients, strict=False):
+    lens = view.lens or Lens("", "perspective", ())
+    for name, coefficient in zip(COEFFICIENTS[lens.model], lens.coefficients, strict=False):
         if not abs(coefficient) <= max_coefficient:  # also refuses NaN
             problem = f"expected a lens coefficient {name} within +-{max_coefficient:g}, found {coefficient:g}"
-            text = f"view {view.name}: {problem} ({view.lens.name})"
+            text = f"view {view.name}: {problem} ({lens.name})"
             raise SceneError(path, text, "correct it, or undistort the images first")
+    return pose
 
 
 def check_camera_count(path: StrPath, count: int) -> None:
@@ -206,20 +206,6 @@ def missing_intrinsics(path: StrPath) -> SceneError:
     """Make the SceneError for cameras without a focal length."""
     problem = "expected intrinsics of the cameras (fx, fy, cx, cy), found none"
     return SceneError(path, problem, "add them in pixels, for all views or for each")
-
-
-def _in_pixels(Ks: np.ndarray, sizes: list[tuple[int, int]]) -> tuple[np.ndarray, list[tuple[int, int]]]:
-    """Convert intrinsics that are divided by the image size to pixels; return intrinsics and sizes.
-
-    An unknown size becomes 1 x 1. Intrinsics in pixels are returned unchanged.
-    """
-    is_relative = (Ks[:, 0, 0] < MAX_NORMALISED_FOCAL) & (Ks[:, 1, 1] < MAX_NORMALISED_FOCAL)
-    is_relative &= (np.abs(Ks[:, :2, 2] - 0.5) < 1).all(1)
-    # If an image has only a few pixels, small focal lengths may be in pixels, too
-    if not is_relative.all() or any(0 < min(size) <= MAX_NORMALISED_FOCAL for size in sizes):
-        return Ks, sizes
-    sizes = [size if min(size) > 0 else (1, 1) for size in sizes]
-    return Ks * np.array([(w, h, 1) for w, h in sizes], np.float64)[:, :, None], sizes
 
 
 def check_camera(path: StrPath, name: str, pose: np.ndarray, K: np.ndarray) -> None:

@@ -11,12 +11,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from plyfile import PlyData
 
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import read_json
 from gsmerge.io.cameras.camera_file import Convention, StoredView
-from gsmerge.io.formats.ply import open_ply
+from gsmerge.io.formats.ply import Element, open_ply
 from gsmerge.io.photo_files import PhotoArrays
 
 
@@ -44,9 +43,9 @@ class CameraSource:
         return entries[0] if entries and all(isinstance(entry, dict) for entry in entries) else {}
 
     @cached_property
-    def ply(self) -> PlyData:
+    def ply(self) -> dict[str, Element]:
         """Elements of a PLY file."""
-        return open_ply(self.path)[0]
+        return open_ply(self.path)[0].elements
 
 
 def check_objects(path: Path, entries: Sequence[Any], place: str = "the file") -> None:

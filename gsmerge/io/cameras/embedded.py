@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from plyfile import PlyListProperty
 
 from gsmerge.errors import SceneError
 from gsmerge.io.cameras.camera_file import StoredView, make_pinhole
@@ -22,22 +21,22 @@ def read_sharp(source: CameraSource) -> StoredCameras | None:
     """
     if find_format(source.path).read is not PLY.read:
         return None
-    data = source.ply
-    present = [name for name in _SHARP_ELEMENTS if name in data]
-    if "vertex" not in data or not {"extrinsic", "intrinsic"}.issubset(present):
+    elements = source.ply
+    present = [name for name in _SHARP_ELEMENTS if name in elements]
+    if "vertex" not in elements or not {"extrinsic", "intrinsic"}.issubset(present):
         return None
-    for element in (data[name] for name in present):
-        if element.count > 16 or len(element.properties) != 1 or isinstance(element.properties[0], PlyListProperty):
+    for element in (elements[name] for name in present):
+        if element.count > 16 or len(element.columns) != 1 or element.has_lists:
             return None
     with np.errstate(all="ignore"):  # the check of all cameras refuses NaN
-        numbers = {name: np.asarray([row[0] for row in data[name].data], np.float64) for name in present}
+        numbers = {name: np.asarray([row[0] for row in elements[name].rows[:]], np.float64) for name in present}
     extrinsic, intrinsic, size = numbers["extrinsic"], numbers["intrinsic"], numbers.get("image_size", np.zeros(0))
     if len(intrinsic) == 4 and "image_size" not in numbers:  # first versions write focal lengths and size
         focal_lengths, size = intrinsic[:2], intrinsic[2:]
         intrinsic = make_pinhole(*focal_lengths, *(size / 2)).reshape(-1)
     sharp_layers = 2  # Gaussians in each cell of the grid, of a front and a back layer
-    side = round((data["vertex"].count / sharp_layers) ** 0.5)
-    if sharp_layers * side * side != data["vertex"].count or len(size) != 2 or not (size > 0).all():
+    side = round((elements["vertex"].count / sharp_layers) ** 0.5)
+    if sharp_layers * side * side != elements["vertex"].count or len(size) != 2 or not (size > 0).all():
         return None
     if len(extrinsic) not in (12, 16) or len(intrinsic) != 9:
         problem = f"expected 16 and 9 numbers of a camera, found {len(extrinsic)} and {len(intrinsic)}"

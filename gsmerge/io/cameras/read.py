@@ -119,18 +119,15 @@ def _resolve(path: Path) -> Path:
             check_program(path)
             raise SceneError(path, "expected transforms.json, cameras.json, a COLMAP model or results.npz, found none")
         path = camera_path
-    return path if path.is_dir() else _find_whole(path) or path
-
-
-def _find_whole(path: Path) -> Path | None:
-    """Return the folder of the COLMAP model or the keyframes of which a file is a part; None for any other file."""
+    if path.is_dir():
+        return path
     check_program(path)
     check_file(path)
     if path.suffix == ".json":
         is_keyframe = is_keyframes(path.parent) and KEYFRAME in CameraSource(path).object
-        return path.parent if is_keyframe else None
+        return path.parent if is_keyframe else path
     if path.suffix not in (".bin", ".txt") or path.stem not in ("cameras", "images", "points3D"):
-        return None
+        return path
     if not is_colmap(path.parent):
         raise SceneError(path, "expected a COLMAP model with cameras and images files, found no pair of them")
     return path.parent

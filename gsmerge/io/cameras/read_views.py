@@ -34,13 +34,28 @@ _FOCAL = ("fx", "fy", "angle_x", "angle_y")  # values from which a focal length 
 
 def read_views(source: CameraSource, layout: ViewLayout) -> StoredCameras:
     """Read the cameras of a file by its layout. If a value is missing or wrong, SceneError names file, view and key."""
-    entries = layout.views(source) if callable(layout.views) else _list_entries(source, layout.views)
+    if callable(layout.views):
+        entries = layout.views(source)
+    else:  # the key of a list in a JSON object; with the key "", the whole file is the list
+        stored = source.object.get(layout.views) if layout.views else source.json
+        place = repr(layout.views) if layout.views else "the file"
+        if not isinstance(stored, list):
+            raise SceneError(source.path, f"expected {place} to be a list of objects, found something else")
+        check_objects(source.path, stored, place)
+        check_camera_count(source.path, len(stored))
+        entries = [Entry(view, source.object) for view in stored]
     shared: dict[int, dict[str, Any]] = {}  # id of an object that views share -> its values, converted only once
     cameras: list[tuple[Path, str, np.ndarray, dict[str, Any]]] = []
     for i, entry in enumerate(entries):
         names = (entry.values[key] for key in _alternatives(layout.name) if entry.values.get(key) not in (None, ""))
         path, name = entry.path or source.path, entry.name or str(next(names, f"view {i}"))
-        _check_keys(path, name, layout, entry)
+        missing: list[Key] = [key for key in layout.pose.keys if entry.values.get(key) is None]
+        for key in layout.required_keys:
+            if _find_value(entry.values, key) is None and _find_value(entry.shared, key) is None:
+                missing.append(key)
+        if missing:
+            words = ", ".join(" or ".join(map(repr, _alternatives(key))) for key in missing)
+            raise SceneError(path, f"view {name}: expected {words}, found none")
         if id(entry.shared) not in shared:
             with number_errors(path, "expected numbers"):
                 shared[id(entry.shared)] = _camera_values(layout, entry.shared)
@@ -61,17 +76,6 @@ def read_views(source: CameraSource, layout: ViewLayout) -> StoredCameras:
     return StoredCameras(views if layout.finish is None else layout.finish(source, views))
 
 
-def _list_entries(source: CameraSource, key: str) -> list[Entry]:
-    """List the views under a ``key`` of a JSON object. With the key "", the whole file is the list."""
-    views = source.object.get(key) if key else source.json
-    place = repr(key) if key else "the file"
-    if not isinstance(views, list):
-        raise SceneError(source.path, f"expected {place} to be a list of objects, found something else")
-    check_objects(source.path, views, place)
-    check_camera_count(source.path, len(views))
-    return [Entry(view, source.object) for view in views]
-
-
 def _alternatives(key: Key) -> tuple[str, ...]:
     """Return all names of a :data:`Key`, the most preferred first."""
     return (key,) if isinstance(key, str) else key
@@ -80,17 +84,6 @@ def _alternatives(key: Key) -> tuple[str, ...]:
 def _find_value(values: Mapping[str, Any], key: Key) -> Any:
     """Return the value of a key under the first of the key's names that has a value; None if no name has a value."""
     return next((values[name] for name in _alternatives(key) if values.get(name) is not None), None)
-
-
-def _check_keys(path: Path, name: str, layout: ViewLayout, entry: Entry) -> None:
-    """Raise SceneError, which names the keys, if a view lacks keys that the layout requires."""
-    missing: list[Key] = [key for key in layout.pose.keys if entry.values.get(key) is None]
-    for key in layout.required_keys:
-        if _find_value(entry.values, key) is None and _find_value(entry.shared, key) is None:
-            missing.append(key)
-    if missing:
-        words = ", ".join(" or ".join(map(repr, _alternatives(key))) for key in missing)
-        raise SceneError(path, f"view {name}: expected {words}, found none")
 
 
 def _camera_values(layout: ViewLayout, values: Mapping[str, Any]) -> dict[str, Any]:

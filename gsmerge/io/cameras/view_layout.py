@@ -49,12 +49,14 @@ class Matrix:
 
     def read(self, values: Mapping[str, Any]) -> np.ndarray:
         """Read the matrix; errors as in :func:`convert_value`."""
-        return np.asarray(convert_value(self._to_matrix, self.key, values[self.key]))
-
-    def _to_matrix(self, value: Any) -> np.ndarray:
-        """Make the matrix from the lists of numbers that the file stores."""
-        array = to_array(value)
-        return array if self.shape is None else array.reshape(self.shape)
+        shape = self.shape
+        return np.asarray(
+            convert_value(
+                lambda value: to_array(value) if shape is None else to_array(value).reshape(shape),
+                self.key,
+                values[self.key],
+            )
+        )
 
 
 def rotation_of_matrix(numbers: np.ndarray) -> np.ndarray:

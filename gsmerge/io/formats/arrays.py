@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
+from pathlib import Path
 
 import numpy as np
 
-from gsmerge.errors import Doubt
+from gsmerge.errors import Doubt, SceneError
 from gsmerge.geometry.transforms import (
     apply_harmonics_rotation,
     harmonics_rotation,
@@ -17,7 +19,7 @@ from gsmerge.geometry.transforms import (
     rotmat_to_quat,
     sh0_to_rgb,
 )
-from gsmerge.io.bounds import ReadBudget
+from gsmerge.io.bounds import ReadBudget, read_errors
 from gsmerge.kernels.elementary import log
 from gsmerge.kernels.matrices import matmul
 from gsmerge.types import Gaussians
@@ -242,7 +244,12 @@ class PackedRows:
                 is_empty = part_block.start >= part_block.stop  # the part has no row of the block
                 columns += [] if is_empty else [part.unpack(part_block)]
                 part_start += part.count
-            return _to_table(concatenate(columns, num_higher)).view(self.dtype)[:, 0]
+            joined = concatenate(columns, num_higher)
+            harmonics = joined.harmonics.transpose(0, 2, 1).reshape(len(joined), 3 * num_higher)
+            # Columns side by side, in the order of the names in :func:`pack_rows`
+            parts = (joined.means, joined.sh0, harmonics, joined.opacities[:, None], joined.log_scales, joined.quats)
+            table = np.concatenate(parts, axis=1, dtype=np.float32, casting="same_kind")
+            return table.view(self.dtype)[:, 0]
 
 
 def _num_rest(row_type: np.dtype[np.void]) -> int:
@@ -250,12 +257,45 @@ def _num_rest(row_type: np.dtype[np.void]) -> int:
     return sum(name.startswith("f_rest_") for name in row_type.names or ())
 
 
-def _to_table(columns: Columns) -> np.ndarray:
-    """Put columns side by side, as float32, in the order of the names in :func:`pack_rows`."""
-    count, num_higher = columns.harmonics.shape[:2]
-    harmonics = columns.harmonics.transpose(0, 2, 1).reshape(count, 3 * num_higher)
-    parts = (columns.means, columns.sh0, harmonics, columns.opacities[:, None], columns.log_scales, columns.quats)
-    return np.concatenate(parts, axis=1, dtype=np.float32, casting="same_kind")
+def truncated(path: Path, expected: str, num_whole: int, reason: str) -> SceneError:
+    """Make the SceneError for a file that ends, or is damaged, after ``num_whole`` complete rows."""
+    return SceneError(
+        path, f"truncated or damaged: expected {expected}, found {num_whole} complete ({reason})", EXPORT_AGAIN
+    )
+
+
+@dataclass(frozen=True)
+class FileRows:
+    """Rows of numbers in a file; ``rows[start:stop]`` reads the rows of the slice, and is thread-safe."""
+
+    path: Path
+    dtype: np.dtype[np.void]
+    count: int
+    offset: int  # of the first row, in bytes from the start of the file
+    inode: int  # of the file
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, block: slice) -> np.ndarray:
+        start, stop, _ = block.indices(self.count)
+        out = np.empty(stop - start, self.dtype)
+        with read_errors(self.path), self.path.open("rb") as file:
+            if os.fstat(file.fileno()).st_ino != self.inode:  # rows of two files must not mix
+                raise SceneError(self.path, "was replaced while it was read", "run this again")
+            file.seek(self.offset + start * self.dtype.itemsize)
+            num_bytes = file.readinto(out.view(np.uint8).data)
+        if num_bytes < out.nbytes:
+            num_whole = start + num_bytes // self.dtype.itemsize
+            raise truncated(self.path, f"{self.count} rows", num_whole, "it became shorter while it was read")
+        return out
+
+    def view(self, dtype: np.dtype[np.void]) -> FileRows:
+        """Return the same rows with other names of columns."""
+        return replace(self, dtype=dtype)
+
+
+Rows = np.ndarray | FileRows | PackedRows  # a slice of them is an array of rows with one field per column
 
 
 @dataclass(frozen=True, eq=False)
@@ -265,7 +305,7 @@ class StoredRows:
     After the function ``adapt``, ``rows`` have at least the columns ``REQUIRED_COLUMNS`` of a PLY file.
     """
 
-    rows: np.ndarray | PackedRows
+    rows: Rows
     layout: str  # the name of the layout for people
     format: str
     encoding: str | None  # of the opacities: "logit", "raw", or None if the file does not say
@@ -373,24 +413,22 @@ def rotator(rotation: np.ndarray, num_higher: int) -> Callable[[Columns], Column
     # A matrix that mirrors maps an ellipsoid to the same ellipsoid as the negative matrix, which is a rotation
     sign = np.sign((np.cross(rotation[0], rotation[1]) * rotation[2]).sum())  # of the determinant
     quat = rotmat_to_quat(sign * rotation[None])[0]
-    rotate_harmonics = _harmonics_rotator(rotation, num_higher)
-    return lambda columns: replace(
-        columns,
-        means=matmul(columns.means, rotation.T),
-        quats=multiply_quats(quat, columns.quats),
-        harmonics=rotate_harmonics(columns.harmonics),
-    )
-
-
-def _harmonics_rotator(rotation: np.ndarray, num_higher: int) -> Callable[[np.ndarray], np.ndarray]:
-    """Return a function that rotates ``harmonics [n,num_higher,3]`` by a matrix ``[3,3]``."""
     matrix = harmonics_rotation(num_higher, rotation) if num_higher else np.zeros((0, 0))
     # Entries that are whole numbers up to rounding are rounded, so that the matrix of half a turn is exactly diagonal
     matrix = np.where(np.abs(matrix - np.round(matrix)) < _EXACT, np.round(matrix), matrix)
-    signs = np.diagonal(matrix)[:, None]
-    if np.array_equal(matrix, np.diag(np.diagonal(matrix))):
-        return lambda harmonics: harmonics * signs
-    return lambda harmonics: apply_harmonics_rotation(harmonics, matrix)
+    is_diagonal, signs = np.array_equal(matrix, np.diag(np.diagonal(matrix))), np.diagonal(matrix)[:, None]
+
+    def rotate(columns: Columns) -> Columns:
+        """Rotate Gaussians."""
+        harmonics = columns.harmonics
+        return replace(
+            columns,
+            means=matmul(columns.means, rotation.T),
+            quats=multiply_quats(quat, columns.quats),
+            harmonics=harmonics * signs if is_diagonal else apply_harmonics_rotation(harmonics, matrix),
+        )
+
+    return rotate
 
 
 def to_bytes(values: np.ndarray) -> np.ndarray:

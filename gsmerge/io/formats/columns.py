@@ -92,7 +92,15 @@ def check_columns(path: Path, row_type: np.dtype[np.void], layers: Sequence[str]
     ``layers``: names of other elements that hold Gaussians. Raise SceneError if a column shows that Gaussians are
     incomplete without other data, or if a column of Gaussians has an integer type.
     """
-    _check_types(path, row_type)
+    colors = arrays.color_columns(row_type.names)  # columns such as ``red`` may be bytes
+    for name in row_type.names or ():
+        dtype, is_used = row_type[name], name in (*arrays.REQUIRED_COLUMNS, *colors) or name.startswith("f_rest_")
+        is_color_byte = dtype == np.uint8 and name in colors and colors != arrays.SH0
+        if is_used and dtype.kind != "f" and not is_color_byte:
+            type_name = _WHOLE_TYPES[dtype.kind][dtype.itemsize // 2]
+            meaning = "values of 0 to 255" if dtype.itemsize == 1 else "half floats"
+            problem = f"expected {name} as float, found {type_name}, which may be {meaning} or indices of a codebook"
+            raise SceneError(path, problem, "export it with floats, opacities as logits or in [0, 1]")
     by_kind: dict[ColumnKind | None, list[str]] = {}
     for name in row_type.names or ():
         if name in arrays.REQUIRED_COLUMNS or name.startswith("f_rest_"):
@@ -110,19 +118,6 @@ def check_columns(path: Path, row_type: np.dtype[np.void], layers: Sequence[str]
     parts += [f"{list_names(layers)} (more Gaussians)"] if layers else []
     unused = [name for kind, names in by_kind.items() if kind is None or kind.what for name in names]
     return (Note(f"not used: {'; '.join(parts)}", "columns", unused),) if parts else ()
-
-
-def _check_types(path: Path, row_type: np.dtype[np.void]) -> None:
-    """Raise SceneError if a column of Gaussians has an integer type; columns such as ``red`` may be bytes."""
-    colors = arrays.color_columns(row_type.names)
-    for name in row_type.names or ():
-        dtype, is_used = row_type[name], name in (*arrays.REQUIRED_COLUMNS, *colors) or name.startswith("f_rest_")
-        is_color_byte = dtype == np.uint8 and name in colors and colors != arrays.SH0
-        if is_used and dtype.kind != "f" and not is_color_byte:
-            type_name = _WHOLE_TYPES[dtype.kind][dtype.itemsize // 2]
-            meaning = "values of 0 to 255" if dtype.itemsize == 1 else "half floats"
-            problem = f"expected {name} as float, found {type_name}, which may be {meaning} or indices of a codebook"
-            raise SceneError(path, problem, "export it with floats, opacities as logits or in [0, 1]")
 
 
 def describes_places(name: str) -> bool:

@@ -10,16 +10,20 @@ opacities have 8 bits. Harmonics are bytes in the element ``sh``.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-from plyfile import PlyData, PlyElement, PlyListProperty
 
 from gsmerge.errors import SceneError
 from gsmerge.geometry.transforms import rgb_to_sh0
 from gsmerge.io.formats import arrays
 from gsmerge.io.formats.arrays import PACKED
 from gsmerge.kernels.elementary import log, log1p
+
+if TYPE_CHECKING:
+    from gsmerge.io.formats.ply import Element
 
 CHUNK = 256  # Gaussians in a chunk
 _POSITION_RANGES = tuple(f"{bound}_{axis}" for bound in ("min", "max") for axis in "xyz")
@@ -32,9 +36,9 @@ SH_RANGE = 8.0  # bytes of harmonics span -4 to 4
 _HARMONICS = (np.r_[0, (np.arange(1, 255) + 0.5) / 256, 1].astype(np.float32) - 0.5) * SH_RANGE
 
 
-def packed_rows(path: Path, data: PlyData) -> arrays.PackedRows:
+def packed_rows(path: Path, elements: Mapping[str, Element]) -> arrays.PackedRows:
     """Return the rows of a compressed PLY as rows of an ordinary PLY, with opacities as logits."""
-    vertex, chunk = data["vertex"], data["chunk"]
+    vertex, chunk = elements["vertex"], elements["chunk"]
     _check_types(path, vertex, PACKED, ("u4", "i4"))
     _check_types(path, chunk, RANGE_COLUMNS, ("f4", "f8"))
     count, num_chunks = vertex.count, -(-vertex.count // CHUNK)
@@ -43,47 +47,61 @@ def packed_rows(path: Path, data: PlyData) -> arrays.PackedRows:
     if chunk.count < num_chunks:
         problem = f"expected {num_chunks} chunks for {count} Gaussians, found {chunk.count}"
         raise SceneError(path, problem, "export it again")
-    num_higher = _num_rest(path, data, count) // 3
-    return arrays.pack_rows([arrays.Packed(count, num_higher, lambda block: _unpack(data, num_higher, block))])
+    num_rest, ranges = _num_rest(path, elements, count), chunk.rows[:]
+
+    def unpack(block: slice) -> arrays.Columns:
+        """Unpack a block of Gaussians."""
+        codes = np.empty((block.stop - block.start, num_rest), np.uint8)
+        harmonics = elements["sh"].rows[block] if num_rest else codes
+        for i in range(num_rest):
+            codes[:, i] = harmonics[f"f_rest_{i}"]
+        return _unpack(vertex.rows[block], ranges, codes, block)
+
+    return arrays.pack_rows([arrays.Packed(count, num_rest // 3, unpack)])
 
 
-def _check_types(path: Path, element: PlyElement, columns: tuple[str, ...], types: tuple[str, str]) -> None:
+def _check_types(path: Path, element: Element, columns: tuple[str, ...], types: tuple[str, str]) -> None:
     """Raise SceneError if an element lacks one of ``columns``, or stores it in a type that is not in ``types``."""
-    stored = {p.name: p.val_dtype for p in element.properties if not isinstance(p, PlyListProperty)}
+    row_type = element.rows.dtype
+    stored = {name: row_type[name].str[1:] for name in row_type.names or ()}  # of an element without lists
     wrong = next((name for name in columns if stored.get(name) not in types), None)
     if wrong is not None:
         place, found = f"in element '{element.name}' of a compressed file", stored.get(wrong, "none")
         raise SceneError(path, f"expected {wrong} {place} as {types[0]}, found {found}", "export it again")
 
 
-def _unpack(data: PlyData, num_higher: int, block: slice) -> arrays.Columns:
-    """Unpack a block of Gaussians, with opacities as logits."""
-    vertex, chunk = data["vertex"].data[block], data["chunk"].data
+def _unpack(vertex: np.ndarray, chunk: np.ndarray, codes: np.ndarray, block: slice) -> arrays.Columns:
+    """Unpack the Gaussians of a ``block`` of rows, with opacities as logits.
+
+    ``vertex``: the rows. ``chunk``: the bounds of all chunks. ``codes``: bytes of harmonics, ``[n,3k]``.
+    """
     words = {name: vertex[name].astype(np.uint32) for name in PACKED}
     chunk_ids = np.arange(block.start, block.stop) // CHUNK
     *colors, alpha = _unpack_words(words["packed_color"], (8, 8, 8, 8))
     largest = (words["packed_rotation"] >> np.uint32(30)).astype(np.int64)  # index of a component of wxyz
     smallest = np.stack(_unpack_words(words["packed_rotation"], (10, 10, 10)), 1) - 0.5  # within +-sqrt(1/2)
-    codes = np.empty((len(vertex), 3 * num_higher), np.uint8)
-    for i in range(3 * num_higher):
-        codes[:, i] = data["sh"].data[f"f_rest_{i}"][block]
     return arrays.Columns(
         means=_interpolate(_unpack_words(words["packed_position"], (11, 10, 11)), chunk, _POSITION_RANGES, chunk_ids),
         quats=arrays.from_smallest_three(largest, smallest * np.sqrt(2.0)),
         log_scales=_interpolate(_unpack_words(words["packed_scale"], (11, 10, 11)), chunk, _SCALE_RANGES, chunk_ids),
         opacities=log(alpha) - log1p(-alpha),  # infinite for 0 and 1, which the reader accepts
         sh0=rgb_to_sh0(_interpolate(colors, chunk, COLOR_RANGES, chunk_ids)),
-        harmonics=_HARMONICS[codes.reshape(len(vertex), 3, num_higher).transpose(0, 2, 1)],
+        harmonics=_HARMONICS[codes.reshape(len(vertex), 3, -1).transpose(0, 2, 1)],
     )
 
 
-def _num_rest(path: Path, data: PlyData, count: int) -> int:
+def _num_rest(path: Path, elements: Mapping[str, Element], count: int) -> int:
     """Count the columns of harmonics above degree 0; raise SceneError unless they make up degree 0, 1, 2 or 3."""
-    if "sh" not in data:
+    if "sh" not in elements:
         return 0
-    names = {p.name for p in data["sh"].properties if p.dtype() == "=u1"}  # columns of bytes
+    row_type = elements["sh"].rows.dtype
+    names = {name for name in row_type.names or () if row_type[name] == np.uint8}
     num_rest = len(names)
-    if num_rest not in (9, 24, 45) or names != {f"f_rest_{i}" for i in range(num_rest)} or data["sh"].count != count:
+    if (
+        num_rest not in (9, 24, 45)
+        or names != {f"f_rest_{i}" for i in range(num_rest)}
+        or elements["sh"].count != count
+    ):
         problem = f"expected 9, 24 or 45 harmonics of {count} Gaussians in element 'sh', found others"
         raise SceneError(path, problem, "export it again")
     return num_rest

@@ -26,7 +26,7 @@ def read_extra_columns(info: FileInfo) -> np.ndarray:
     if len(rows) != info.count:
         problem = f"expected {info.count:,} rows, found {len(rows):,}, since the file changed while it was read"
         raise SceneError(path, problem, "run the command again")
-    return ply.read_columns(path, rows, [name for name in info.extra_columns if not rows.dtype[name].hasobject])
+    return ply.read_columns(rows, info.extra_columns)
 
 
 def join_extra_columns(parts: Sequence[np.ndarray]) -> tuple[np.ndarray, list[str]]:

@@ -193,7 +193,7 @@ def read_rows(path: Path) -> StoredRows:
         content = _Content(budget, file, document, file.tell(), total)
         for primitive, transform in _walk_splats(document, budget):
             budget.check_steps(_STEPS_PER_PART * len(parts), "steps for meshes")
-            parts.append(_read_splats(content, primitive, transform, sizes))
+            parts.append(_read_splats(content, primitive, transform, sizes, parts))
     if not parts:
         problem = f"expected Gaussians ({NAME}), found a .glb of points or a mesh"
         raise SceneError(path, problem, "name the .ply that the model wrote beside it")
@@ -351,15 +351,17 @@ class _Attributes:
         return values
 
 
-def _read_splats(content: _Content, primitive: dict[str, Any], transform: np.ndarray, sizes: dict[str, int]) -> Packed:
+def _read_splats(
+    content: _Content, primitive: dict[str, Any], transform: np.ndarray, sizes: dict[str, int], before: Sequence[Packed]
+) -> Packed:
     """Read the Gaussians of a primitive, and apply the matrix ``transform [4,4]`` of its node to them.
 
-    The bytes of each attribute are added to ``sizes``.
+    The bytes of each attribute are added to ``sizes``. ``before``: the Gaussians of the primitives before.
     """
     splats = primitive["extensions"][NAME]
     if COMPRESSED in splats.get("extensions", {}):
         packed = content.read_view(splats["extensions"][COMPRESSED]["bufferView"])
-        _, rows, column_bytes, _ = read_packed(content.budget.path, packed)
+        _, rows, column_bytes, _ = read_packed(content.budget, packed, before)
         sizes |= {name: sizes.get(name, 0) + size for name, size in column_bytes.items()}
         rotate = _transformer(transform, rows.num_higher)
         return Packed(rows.count, rows.num_higher, lambda block: rotate(rows.unpack(block)))

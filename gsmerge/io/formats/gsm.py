@@ -175,28 +175,26 @@ def read_rows(path: Path) -> StoredRows:
     num_batches = len(batches) if isinstance(batches, list) else 0
     stored = to_stored([Packed(n, num_higher, unpack)], f"{num_batches} batch(es) of views", sizes)
     copied = copied_comments(comments if isinstance(comments, list) else ())
-    return replace(stored, format="binary little-endian", comments=copied, notes=_picture_notes(file.header["about"]))
-
-
-def _picture_notes(about: Mapping[str, Any]) -> tuple[str, ...]:
-    """Note if batches of views have no photos, and which pictures replace their photos."""
-    names = about.get("pictures")
-    replacements = sorted({str(name)[:40] for name in names if name != "photos"}) if isinstance(names, list) else []
-    return (f"some batches have no photos; {' and '.join(replacements)} replace them",) if replacements else ()
+    pictures, notes = file.header["about"].get("pictures"), tuple[str, ...]()
+    others = sorted({str(name)[:40] for name in pictures if name != "photos"}) if isinstance(pictures, list) else []
+    if others:
+        notes = (f"some batches have no photos; {' and '.join(others)} replace them",)
+    return replace(stored, format="binary little-endian", comments=copied, notes=notes)
 
 
 def list_batches(path: Path) -> list[dict[str, Any]]:
-    """List the batches of views in the header of a ``.gsm``, each with its counts and the names of its views."""
-    batches = read_header(path)["about"].get("batches")
-    return [_describe_batch(batch) for batch in batches if isinstance(batch, dict)] if isinstance(batches, list) else []
+    """List the batches of views in the header of a ``.gsm``, each with its counts and the names of its views.
 
-
-def _describe_batch(batch: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the counts of a batch of views, and the views' names; entries of a wrong type are left out."""
-    views = batch.get("views")
-    counts = {name: batch.get(name) for name in ("num_views", "num_input", "num_new")}
-    known: dict[str, Any] = {name: count for name, count in counts.items() if isinstance(count, int)}
-    return known | {"views": [*map(str, views.values())] if isinstance(views, dict) else []}
+    Entries of a wrong type are left out.
+    """
+    batches, described = read_header(path)["about"].get("batches"), list[dict[str, Any]]()
+    for batch in batches if isinstance(batches, list) else ():
+        if isinstance(batch, dict):
+            counts = {name: batch.get(name) for name in ("num_views", "num_input", "num_new")}
+            known = {name: count for name, count in counts.items() if isinstance(count, int)}
+            views = batch.get("views")
+            described.append(known | {"views": [*map(str, views.values())] if isinstance(views, dict) else []})
+    return described
 
 
 def holds_views(path: Path) -> bool:

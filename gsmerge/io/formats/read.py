@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +13,10 @@ from gsmerge.errors import Doubt, Note, SceneError
 from gsmerge.geometry.transforms import lower_median, rgb_to_sh0
 from gsmerge.io.formats import arrays, ply
 from gsmerge.io.formats.arrays import StoredRows
-from gsmerge.io.formats.color_units import RGB_NOTE, ColorUnits, choose_units, find_units, judge_colors
-from gsmerge.io.formats.scale_units import LINEAR_NOTE, SAMPLES, ScaleJudgement, judge_scales, log_of_scales
+from gsmerge.io.formats.color_units import ColorUnits, choose_colors
+from gsmerge.io.formats.scale_units import LINEAR_NOTE, are_scales_linear, with_linear_scales
 from gsmerge.io.formats.table import META, PLY, READ_ENDINGS, find_format
-from gsmerge.kernels.elementary import exp, log
+from gsmerge.kernels.elementary import exp
 from gsmerge.kernels.stored_rows import convert_rows
 from gsmerge.runtime.memory import free_pages, make_array
 from gsmerge.runtime.threads import parallel_map
@@ -181,7 +181,7 @@ def read_gaussians(
         problem = f"expected one of {', '.join(READ_ENDINGS)}, found {format_.ending}, which is written and not read"
         raise SceneError(path, problem, "name the file that it was made from")
     if format_.read is ply.read_rows:
-        return read_ply(path, opacity=opacity, scales=scales, colors=colors)
+        return read_parts([path], opacity=opacity, scales=scales, colors=colors)
     return convert_stored([path], [format_.read(path)], "auto")
 
 
@@ -200,19 +200,18 @@ def convert_stored(
     names = tuple(dtype.names or ())
     file_bytes = sum(path.stat().st_size + part.bytes_beside for path, part in zip(paths, parts, strict=True))
     out = _make_arrays(dtype, sum(len(part.rows) for part in parts), file_bytes)
-    num_clipped, num_zero_quats = _fill_arrays(paths, parts, out)
-    judgement = _judge_scales(paths, parts, out, scales)
-    scale_notes = (LINEAR_NOTE.format(judgement.why),) if judgement.linear and judgement.why else ()
-    if judgement.linear:
-        parts = [_with_linear_scales(part) for part in parts]
-        num_clipped, num_zero_quats = _fill_arrays(paths, parts, out)
+    num_clipped, num_zero_quats = _fill_arrays(parts, out)
+    is_linear, scale_reason = are_scales_linear(path, stored, out, scales)
+    scale_notes = (LINEAR_NOTE.format(scale_reason),) if is_linear and scale_reason else ()
+    if is_linear:
+        parts = list(map(with_linear_scales, parts))
+        num_clipped, num_zero_quats = _fill_arrays(parts, out)
     damage = _set_aside_impossible(out) if num_clipped else ()
     empty = find_empty(path, out)
-    units, color_note, open_units = _choose_colors(parts[0], out, colors)
+    units, color_note, open_units = choose_colors(stored, out, colors)
     if units is not None:
         out["sh0"][:] = rgb_to_sh0(units.rgb(out["sh0"]))
-    encoding, is_guess = _choose_encoding(paths, parts, out["opacities"], empty, opacity)
-    _activate(out["opacities"], out["valid"], encoding)
+    encoding, is_guess = _decode_opacities(paths, parts, out, empty, opacity)
     num_nonfinite = clear_invalid(path, out)
     clear_rows(out, empty)
     byte_columns = tuple(name for name in names if dtype[name].itemsize == 1)
@@ -238,7 +237,7 @@ def convert_stored(
         num_nonfinite=num_nonfinite,
         num_empty=len(empty),
         num_zero_quats=max(0, num_zero_quats - len(empty)),  # empty rows usually have zero quaternions
-        odd_scales="" if judgement.linear else judgement.why,
+        odd_scales="" if is_linear else scale_reason,
         color_units=units,
         color_note=color_note,
         open_units=open_units,
@@ -262,105 +261,35 @@ def _make_arrays(dtype: np.dtype[Any], n: int, file_bytes: int) -> dict[str, np.
     return out | {name: make_array(shape, np.float32, max_bytes) for name, shape in shapes.items()}
 
 
-def _fill_arrays(paths: Sequence[Path], parts: Sequence[StoredRows], out: dict[str, np.ndarray]) -> tuple[int, int]:
+def _fill_arrays(parts: Sequence[StoredRows], out: dict[str, np.ndarray]) -> tuple[int, int]:
     """Fill arrays with the rows of all files; return the numbers of rows with clipped values and with zero quats."""
-    num_clipped = num_zero_quats = start = 0
-    for path, part in zip(paths, parts, strict=True):
-        part_rows = slice(start, start + len(part.rows))
-        clipped, zero_quats = _convert_file(path, part, {name: array[part_rows] for name, array in out.items()})
-        num_clipped, num_zero_quats, start = num_clipped + clipped, num_zero_quats + zero_quats, part_rows.stop
+    blocks, first_row = list[tuple[StoredRows, slice, int]](), 0  # each block, after its file, and the file's first row
+    for part in parts:
+        n, block_rows = len(part.rows), max(1, ply.BLOCK_BYTES // part.rows.dtype.itemsize)
+        blocks += [(part, slice(start, min(start + block_rows, n)), first_row) for start in range(0, n, block_rows)]
+        first_row += n
+
+    def convert(file_block: tuple[StoredRows, slice, int]) -> tuple[int, int]:
+        """Convert a block of rows of a file; return its numbers of clipped values and of zero quats."""
+        part, block, first_row = file_block
+        rows = part.rows[block] if part.adapt is None else part.adapt(part.rows[block])
+        block_out = {name: array[first_row + block.start : first_row + block.stop] for name, array in out.items()}
+        counts, num_done = (0, 0), _convert_with_kernel(rows, block_out)
+        if num_done < len(rows):
+            counts = _convert_with_numpy(rows[num_done:], {name: array[num_done:] for name, array in block_out.items()})
+        if block.start % FREED_ROWS < block.stop - block.start:  # the first block after every FREED_ROWS rows
+            free_pages(out.values())
+        return counts
+
+    num_clipped, num_zero_quats = map(sum, zip(*parallel_map(convert, blocks), strict=True))
     return num_clipped, num_zero_quats
-
-
-def _judge_scales(
-    paths: Sequence[Path], parts: Sequence[StoredRows], out: dict[str, np.ndarray], choice: ScaleChoice
-) -> ScaleJudgement:
-    """Judge whether stored scales are linear or logarithms; ``out`` has scales that were read as logarithms.
-
-    Only the scales of a PLY file may be linear. Scales in a file of gsmerge are logarithms, unless the caller says
-    otherwise.
-    """
-    judgement = judge_scales(out)
-    # The rows of a PLY file are a NumPy array, and those of other formats are not
-    if not isinstance(parts[0].rows, np.ndarray) or (choice == "auto" and parts[0].encoding is not None):
-        return ScaleJudgement(linear=False, why="" if judgement.linear else judgement.why)
-    if choice == "linear":
-        with np.errstate(all="ignore"):
-            # ``out`` has the exponential of each stored number, which is below 1 if the number is negative
-            negative = 100 * float(np.count_nonzero(out["scales"][out["valid"]] < 1)) / max(1, 3 * out["valid"].sum())
-        if negative > 100 * arrays.MAX_STRAY:
-            problem = f"expected scales of at least 0, as --hint scales=linear says, found {negative:.3g} % below"
-            raise SceneError(paths[0], f"{problem}, like logarithms", "leave out --hint scales=linear")
-    if choice != "auto":
-        return ScaleJudgement(linear=choice == "linear", why="")
-    columns = arrays.color_columns(parts[0].rows.dtype.names)
-    if columns == arrays.PLAIN_COLORS[1] and not arrays.are_logarithms(log(out["scales"][:, 0])):
-        return ScaleJudgement(linear=True, why="the columns are r, g and b and hardly any scale is negative")
-    return judgement
-
-
-def _choose_colors(
-    part: StoredRows, out: dict[str, np.ndarray], choice: ColorChoice
-) -> tuple[ColorUnits | None, str, ColorUnits | None]:
-    """Choose the units of stored colours: those of RGB, or None for harmonics of degree 0.
-
-    Also return a note if the units are guessed. The third result is units of RGB to choose if photos confirm them. Only
-    a PLY file may have RGB. Colours in a file of gsmerge are harmonics, unless the caller says otherwise.
-    """
-    names = part.rows.dtype.names or ()
-    is_stated = choice == "sh" or (choice == "auto" and part.encoding is not None)
-    if is_stated or not isinstance(part.rows, np.ndarray) or arrays.color_columns(names) != arrays.SH0:
-        return None, "", None
-    rows = np.flatnonzero(out["valid"])
-    rows = rows[:: max(1, len(rows) // SAMPLES)]
-    stored = out["sh0"][rows, 0]
-    if choice == "rgb":
-        return choose_units(stored), "", None
-    has_plain = all(name in names and part.rows.dtype[name] == np.uint8 for name in arrays.PLAIN_COLORS[0])
-    part_rows = rows[rows < len(part.rows)]
-    plain = np.stack([part.rows[name][part_rows] for name in arrays.PLAIN_COLORS[0]], 1) if has_plain else None
-    units, reason = judge_colors(stored[: len(part_rows)], plain) or (None, "")
-    return (None, "", find_units(stored)) if units is None else (units, RGB_NOTE.format(units.name, reason), units)
-
-
-def _with_linear_scales(part: StoredRows) -> StoredRows:
-    """Return rows whose linear scales become logarithms when a block of the rows is read."""
-    adapt = part.adapt
-    return replace(part, adapt=lambda rows: log_of_scales(rows) if adapt is None else adapt(log_of_scales(rows)))
-
-
-def _convert_file(path: Path, stored: StoredRows, out: dict[str, np.ndarray]) -> tuple[int, int]:
-    """Fill arrays with the rows of one file; return the numbers of rows with clipped values and with zero quats."""
-    n, block_rows = len(stored.rows), max(1, ply.BLOCK_BYTES // stored.rows.dtype.itemsize)
-    with ply.open_rows(path, stored.rows) as read:
-
-        def convert(start: int) -> tuple[int, int]:
-            """Convert the block of rows from ``start`` on; return its numbers of clipped values and of zero quats."""
-            block = slice(start, min(start + block_rows, n))
-            rows = read(block) if stored.adapt is None else stored.adapt(read(block))
-            counts = _convert(rows, {name: array[block] for name, array in out.items()})
-            if start % FREED_ROWS < block_rows:  # the first block after every FREED_ROWS rows
-                free_pages(out.values())
-            return counts
-
-        num_clipped, num_zero_quats = map(sum, zip(*parallel_map(convert, range(0, n, block_rows)), strict=True))
-    return num_clipped, num_zero_quats
-
-
-def _convert(rows: np.ndarray, out: dict[str, np.ndarray]) -> tuple[int, int]:
-    """Fill arrays with a block of rows, but leave opacities as stored; return numbers as :func:`_fill_arrays` does."""
-    num_done = _convert_with_kernel(rows, out)
-    out["valid"][:num_done] = True
-    if num_done == len(rows):
-        return 0, 0
-    return _convert_with_numpy(rows[num_done:], {name: array[num_done:] for name, array in out.items()})
 
 
 def _convert_with_kernel(rows: np.ndarray, out: dict[str, np.ndarray]) -> int:
     """Fill arrays with the first rows of a block by the compiled kernel; return how many rows it filled.
 
     The kernel stops before a row with numbers that are not finite or beyond the limits. No row is filled if a used
-    column is missing or any column is not float32.
+    column is missing or any column is not float32. Opacities are left as stored.
     """
     columns: dict[str, Any] = dict(rows.dtype.fields or {})  # name -> type and offset in bytes
     num_higher = out["shN"].shape[1]
@@ -374,14 +303,17 @@ def _convert_with_kernel(rows: np.ndarray, out: dict[str, np.ndarray]) -> int:
     values = rows.view(np.float32).reshape(len(rows), -1)
     sh0, shN = (out[name].reshape(len(rows), -1) for name in ("sh0", "shN"))
     limits = arrays.MAX_POSITION, MAX_HARMONIC, arrays.MAX_LOG_SCALE
-    return convert_rows(
+    num_done = convert_rows(
         values, column_ids, *limits, out["means"], out["quats"], out["scales"], out["opacities"], sh0, shN
     )
+    out["valid"][:num_done] = True
+    return num_done
 
 
 def _convert_with_numpy(rows: np.ndarray, out: dict[str, np.ndarray]) -> tuple[int, int]:
     """Fill arrays with rows of any type; return how many rows have clipped values, and how many have zero quats.
 
+    Opacities are left as stored.
     A row is valid if its numbers are finite, except that a logit may be infinite and a scale zero.
     """
     color_names, num_higher = arrays.color_columns(rows.dtype.names), out["shN"].shape[1]
@@ -434,27 +366,49 @@ def _normalise(quats: list[np.ndarray], out: np.ndarray) -> np.ndarray:
     return is_zero
 
 
-def _choose_encoding(
-    paths: Sequence[Path], parts: Sequence[StoredRows], opacities: np.ndarray, empty: np.ndarray, choice: OpacityChoice
+def _decode_opacities(
+    paths: Sequence[Path],
+    parts: Sequence[StoredRows],
+    out: dict[str, np.ndarray],
+    empty: np.ndarray,
+    choice: OpacityChoice,
 ) -> tuple[str, bool]:
-    """Choose the encoding of opacities, "logit" or "raw", and return whether it is a guess.
+    """Convert stored opacities to [0, 1], in place; return their encoding, "logit" or "raw", and whether it is a guess.
 
-    For a guess, the opacities of the rows ``empty``, which only pad the file, are ignored.
+    For a guess, the opacities of the rows ``empty``, which only pad the file, are ignored. Rows with infinite values
+    other than logits become invalid. Raise SceneError if the values contradict the caller's choice "raw".
     """
+    path, opacities, encoding, is_guess = paths[0], out["opacities"], str(choice), False
     if choice == "raw":
-        _check_raw(paths[0], opacities)
-    if choice != "auto":
-        return choice, False
-    values = opacities if len(empty) == 0 else opacities.copy()
-    values[empty] = np.nan  # ignored below
-    declared = _declared_encoding(paths, parts, values)
-    finite = values[np.isfinite(values)] if declared is None else values[:0]
-    if len(finite) and finite.min() >= 0 and finite.max() <= 255:
-        share = 100 * np.count_nonzero(finite > ply.MAX_LOGIT) / len(finite)
-        if share > 100 * arrays.MAX_STRAY:
-            problem = f"expected opacities as logits or in [0, 1], found 0 to 255: {share:.3g} % are above any logit"
-            raise SceneError(paths[0], problem, "divide them by 255, or for logits use --hint opacity=logit")
-    return declared or ("raw" if arrays.lie_in_unit_range(values) else "logit"), declared is None
+        finite = np.isfinite(opacities)
+        outside = (np.abs(opacities - 0.5) > 0.5 + arrays.UNIT_ROUNDING) & finite
+        if outside.sum() > arrays.MAX_STRAY * finite.sum():
+            share = 100 * outside.sum() / finite.sum()
+            found = f"found {share:.3g} % outside, like logits"
+            problem = f"expected opacities in [0, 1], as --hint opacity=raw says, {found}"
+            raise SceneError(path, problem, "leave out --hint opacity=raw")
+    if choice == "auto":
+        values = opacities if len(empty) == 0 else opacities.copy()
+        values[empty] = np.nan  # ignored below
+        declared = _declared_encoding(paths, parts, values)
+        finite_values = values[np.isfinite(values)] if declared is None else values[:0]
+        if len(finite_values) and finite_values.min() >= 0 and finite_values.max() <= 255:
+            share = 100 * np.count_nonzero(finite_values > ply.MAX_LOGIT) / len(finite_values)
+            if share > 100 * arrays.MAX_STRAY:
+                found = f"found 0 to 255: {share:.3g} % are above any logit"
+                problem = f"expected opacities as logits or in [0, 1], {found}"
+                raise SceneError(path, problem, "divide them by 255, or for logits use --hint opacity=logit")
+        is_guess = declared is None
+        encoding = declared or ("raw" if arrays.lie_in_unit_range(values) else "logit")
+    if encoding == "raw":
+        out["valid"] &= np.isfinite(opacities)
+        np.clip(opacities, 0, 1, out=opacities)
+    else:
+        with np.errstate(all="ignore"):
+            opacities[:] = exp(np.negative(opacities, out=opacities))
+            np.add(opacities, 1, out=opacities)
+            np.reciprocal(opacities, out=opacities)
+    return encoding, is_guess
 
 
 def _declared_encoding(paths: Sequence[Path], parts: Sequence[StoredRows], opacities: np.ndarray) -> str | None:
@@ -477,28 +431,6 @@ def _declared_encoding(paths: Sequence[Path], parts: Sequence[StoredRows], opaci
             problem = f"expected {other} opacities as in {name}, found {encoding} opacities"
             raise SceneError(path, problem, "export all parts alike; if all are logits, use --hint opacity=logit")
     return next((part.encoding for part in parts if part.encoding is not None), None)
-
-
-def _activate(opacities: np.ndarray, valid: np.ndarray, encoding: str) -> None:
-    """Convert stored opacities to [0, 1], in place; rows with infinite values other than logits become invalid."""
-    if encoding == "raw":
-        valid &= np.isfinite(opacities)
-        np.clip(opacities, 0, 1, out=opacities)
-        return
-    with np.errstate(all="ignore"):
-        opacities[:] = exp(np.negative(opacities, out=opacities))
-        np.add(opacities, 1, out=opacities)
-        np.reciprocal(opacities, out=opacities)
-
-
-def _check_raw(path: Path, opacities: np.ndarray) -> None:
-    """Raise SceneError if stored values that the caller declares as opacities in [0, 1] lie outside of [0, 1]."""
-    finite = np.isfinite(opacities)
-    outside = (np.abs(opacities - 0.5) > 0.5 + arrays.UNIT_ROUNDING) & finite
-    if outside.sum() > arrays.MAX_STRAY * finite.sum():
-        share = 100 * outside.sum() / finite.sum()
-        problem = f"expected opacities in [0, 1], as --hint opacity=raw says, found {share:.3g} % outside, like logits"
-        raise SceneError(path, problem, "leave out --hint opacity=raw")
 
 
 def _spread_low_degree(shN: np.ndarray) -> None:

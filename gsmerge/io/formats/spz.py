@@ -93,19 +93,23 @@ def read_rows(path: Path) -> arrays.StoredRows:
         if packed.startswith((GZIP_MAGIC, ZSTANDARD_MAGIC)):  # the rest of other files is not read
             file.seek(0)
             packed = file.read()
-    header, rows, sizes, notes = read_packed(path, packed)
+    header, rows, sizes, notes = read_packed(ReadBudget(path, len(packed)), packed)
     mode = arrays.MIP if header.flags & MIP_FLAG else None
     stored = arrays.to_stored([rows], f".spz version {header.version}", sizes, mode)
     return replace(stored, notes=notes)
 
 
-def read_packed(path: StrPath, packed: bytes) -> tuple[Header, arrays.Packed, dict[str, int], tuple[str, ...]]:
+def read_packed(
+    budget: ReadBudget, packed: bytes, before: Sequence[arrays.Packed] = ()
+) -> tuple[Header, arrays.Packed, dict[str, int], tuple[str, ...]]:
     """Read the content ``packed`` of a ``.spz``; return header, Gaussians, bytes by attribute, and notes.
 
-    The Gaussians have the axes of a ``.ply``. ``path``: the file that holds the content, for errors.
+    The Gaussians have the axes of a ``.ply``. ``budget``: the budget of the file that holds the content. ``before``:
+    Gaussians from the same file that are in memory already, and that count in the budget, too.
     """
+    path = budget.path
     read_parts = _zstandard_parts if packed.startswith(ZSTANDARD_MAGIC) else _gzip_parts
-    header, parts, extensions, num_left = read_parts(ReadBudget(path, len(packed)), packed)
+    header, parts, extensions, num_left = read_parts(budget, packed, before)
     sizes = {name: part.size for name, part in zip(ATTRIBUTES, parts, strict=True) if part.size}
     extensions_flag = 2  # flag of a file with extensions
     axes = _stored_axes(path, extensions) if header.flags & extensions_flag else PLY_AXES
@@ -140,7 +144,9 @@ def _stored_axes(path: StrPath, extensions: bytes) -> str:
     return PLY_AXES
 
 
-def _read_header(budget: ReadBudget, packed: bytes, start: bytes, versions: Sequence[int]) -> Header:
+def _read_header(
+    budget: ReadBudget, packed: bytes, start: bytes, versions: Sequence[int], before: Sequence[arrays.Packed]
+) -> Header:
     """Parse the unpacked header, ``start``; raise SceneError if it is invalid or states too many Gaussians."""
     path = budget.path
     if len(start) < HEADER.size:
@@ -156,16 +162,21 @@ def _read_header(budget: ReadBudget, packed: bytes, start: bytes, versions: Sequ
         raise SceneError(
             path, f"expected at least one Gaussian in {len(packed)} bytes, found a count of 0", arrays.EXPORT_AGAIN
         )
-    arrays.check_gaussian_count(budget, header.count, header.num_higher, sum(header.widths))
+    # Parts of a .glb are stored alike, and those before this one are counted as if they were stored like this one
+    num_higher = max([header.num_higher, *(part.num_higher for part in before)])
+    count = header.count + sum(part.count for part in before)
+    arrays.check_gaussian_count(budget, count, num_higher, sum(header.widths) + 3 * (num_higher - header.num_higher))
     return header
 
 
-def _gzip_parts(budget: ReadBudget, packed: bytes) -> tuple[Header, list[np.ndarray], bytes, int]:
+def _gzip_parts(
+    budget: ReadBudget, packed: bytes, before: Sequence[arrays.Packed]
+) -> tuple[Header, list[np.ndarray], bytes, int]:
     """Read version 1 to 3; return header, columns ``[n,width]`` uint8, extensions, and number of bytes at the end."""
     path = budget.path
     stream = zlib.decompressobj(wbits=31)
     try:
-        header = _read_header(budget, packed, stream.decompress(packed, HEADER.size), (1, 2, 3))
+        header = _read_header(budget, packed, stream.decompress(packed, HEADER.size), (1, 2, 3), before)
         data = stream.decompress(stream.unconsumed_tail, header.count * sum(header.widths))
         # This call also compares the checksum. If the stream has ended, b"" is passed, since ``unused_data`` would
         # count other bytes twice
@@ -182,11 +193,13 @@ def _gzip_parts(budget: ReadBudget, packed: bytes) -> tuple[Header, list[np.ndar
     return header, parts, extensions, len(stream.unused_data)
 
 
-def _zstandard_parts(budget: ReadBudget, packed: bytes) -> tuple[Header, list[np.ndarray], bytes, int]:
+def _zstandard_parts(
+    budget: ReadBudget, packed: bytes, before: Sequence[arrays.Packed]
+) -> tuple[Header, list[np.ndarray], bytes, int]:
     """Read version 4, with a stream per column; return the same as :func:`_gzip_parts`."""
     import zstandard  # few files need it
 
-    path, header = budget.path, _read_header(budget, packed, packed[: HEADER.size], (4,))
+    path, header = budget.path, _read_header(budget, packed, packed[: HEADER.size], (4,), before)
     sizes = [header.count * width for width in header.widths if width]
     table_start, ends = _read_table(path, packed, header, sizes)
     streams = [packed[start:end] for start, end in pairwise(ends)]
@@ -315,24 +328,19 @@ def spz_columns(
 
 
 def _quantise(columns: arrays.Columns, header: Header) -> tuple[np.ndarray, ...]:
-    """Quantise a block of Gaussians to columns of bytes."""
+    """Quantise a block of Gaussians to columns of bytes; harmonics in steps of 8 (degree 1) or 16."""
     fixed = quantise_means(columns.means, header.fraction)
+    count, num_higher = columns.harmonics.shape[:2]
+    steps = np.where(np.arange(num_higher) < 3, 8, 16)[:, None]
+    stepped = (np.round(np.clip(columns.harmonics, -2, 2) * 128) + 128 + steps // 2) // steps * steps
     return (
         fixed.view(np.uint8).reshape(-1, 3, 4)[..., :3].reshape(-1, 9),  # three little-endian bytes for each coordinate
         arrays.to_bytes(255 * columns.opacities)[:, None],
         arrays.to_bytes(255 * (COLOR_SCALE * (columns.colors - 0.5) / SH_C0 + 0.5)),
         arrays.to_bytes(16 * (columns.log_scales + 10)),
         _pack_rotations(columns.quats, header.version),
-        _quantise_harmonics(columns.harmonics),
+        np.clip(stepped, 0, 255).astype(np.uint8).reshape(count, 3 * num_higher),
     )
-
-
-def _quantise_harmonics(harmonics: np.ndarray) -> np.ndarray:
-    """Quantise ``harmonics [n,num_higher,3]`` to bytes ``[n,3 num_higher]``, in steps of 8 (degree 1) or 16."""
-    count, num_higher = harmonics.shape[:2]
-    steps = np.where(np.arange(num_higher) < 3, 8, 16)[:, None]
-    stepped = (np.round(np.clip(harmonics, -2, 2) * 128) + 128 + steps // 2) // steps * steps
-    return np.clip(stepped, 0, 255).astype(np.uint8).reshape(count, 3 * num_higher)
 
 
 def _pack_rotations(quats: np.ndarray, version: int) -> np.ndarray:

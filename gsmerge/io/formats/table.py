@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -208,19 +209,16 @@ def estimate_counts(paths: Sequence[Path]) -> tuple[int, int]:
     The numbers of a ``.ply`` are read from its header. The numbers of other formats are estimated from the file's size.
     A file counts as empty if it cannot be read, or if it is too short for the rows in its header.
     """
-    counts = [
-        ply.header_counts(path, check_size=True) if find_format(path).read is ply.read_rows else _count_by_size(path)
-        for path in paths
-    ]
-    return sum(count for count, _ in counts), max((rest for _, rest in counts), default=0)
-
-
-def _count_by_size(path: Path) -> tuple[int, int]:
-    """Estimate a file's number of Gaussians by its size, as if of degree 0; also return 0 columns ``f_rest_*``."""
-    try:
-        return int(path.stat().st_size / (find_format(path).gaussian_bytes or (math.inf,))[0]), 0
-    except OSError:
-        return 0, 0
+    count = num_rest = 0
+    for path in paths:
+        format_ = find_format(path)
+        if format_.read is ply.read_rows:
+            file_count, file_rest = ply.header_counts(path, check_size=True)
+            count, num_rest = count + file_count, max(num_rest, file_rest)
+        else:  # as if of degree 0
+            with suppress(OSError):
+                count += int(path.stat().st_size / (format_.gaussian_bytes or (math.inf,))[0])
+    return count, num_rest
 
 
 def find_format(path: StrPath) -> Format:

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import os
-import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from former_formats import compressed_bytes
 from messages import refuses
-from plyfile import PlyData
 
 from gsmerge.errors import SceneError, list_doubts
 from gsmerge.io import read_gaussians, read_ply
-from gsmerge.io.formats.ply import header_counts, open_ply, open_rows
+from gsmerge.io.formats import ply
+from gsmerge.io.formats.arrays import FileRows
+from gsmerge.io.formats.ply import header_counts, open_ply
 from gsmerge.io.formats.read import file_notes, read_parts
 from gsmerge.io.formats.table import estimate_counts
 
@@ -42,26 +41,24 @@ def test_empty_lines_between_rows_of_text_are_passed_over(tmp_path: Path, newlin
     assert np.array_equal(read_ply(path).gaussians.means, expected.means)
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="a file that is mapped keeps its size there")
 @pytest.mark.parametrize("packed", [False, True], ids=["plain", "packed"])
 @pytest.mark.parametrize("share", [0.0, 0.2, 0.9])
 def test_a_ply_that_shrinks_while_it_is_read_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, share: float, packed: bool
 ) -> None:
-    """One line, not the signal that reading mapped pages beyond the end would be."""
     path = tmp_path / ("a.compressed.ply" if packed else "a.ply")
     if packed:
         path.write_bytes(compressed_bytes(read_ply(save(tmp_path / "b.ply", columns(20_000))).gaussians))
     else:
         save(path, columns(20_000))
-    size, parse = path.stat().st_size, PlyData.read
+    size, parse = path.stat().st_size, ply.open_ply
 
-    def parse_then_cut(*arguments: Any, **settings: Any) -> PlyData:
-        data = parse(*arguments, **settings)
+    def open_then_cut(opened: Path) -> tuple[ply.Header, int]:
+        header = parse(opened)
         os.truncate(path, round(share * size))
-        return data
+        return header
 
-    monkeypatch.setattr(PlyData, "read", parse_then_cut)
+    monkeypatch.setattr(ply, "open_ply", open_then_cut)
     with refuses(SceneError, f"{path}: truncated or damaged", "shorter"):
         read_ply(path)
 
@@ -69,20 +66,16 @@ def test_a_ply_that_shrinks_while_it_is_read_is_refused(
 @pytest.mark.parametrize("block", [slice(0, 7), slice(7, 12_345), slice(12_345, 20_000), slice(None)], ids=str)
 def test_rows_read_in_blocks_are_those_of_the_file(tmp_path: Path, block: slice) -> None:
     rows, path = columns(20_000), tmp_path / "a.ply"
-    stored = open_ply(save(path, rows))[0]["vertex"].data
-    assert isinstance(stored, np.memmap) == (sys.platform != "win32")
-    for some in (stored, rows):  # of no file: as they are
-        with open_rows(path, some) as read:
-            np.testing.assert_array_equal(read(block), rows[block])
+    stored = open_ply(save(path, rows))[0].elements["vertex"].rows
+    assert isinstance(stored, FileRows)
+    np.testing.assert_array_equal(stored[block], rows[block])
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="needs Linux")
-def test_a_file_that_was_read_takes_no_memory(tmp_path: Path) -> None:
-    path = save(tmp_path / "large.ply", columns(100_000))
-    stored = open_ply(path)[0]["vertex"].data
-    with open_rows(path, stored) as read:
-        assert float(read(slice(None))["x"].sum()) != 0
-    assert resident_bytes(stored.filename) < 0.1 * stored.nbytes
+def test_rows_of_a_file_that_replaces_another_are_not_mixed_with_those_of_the_other(tmp_path: Path) -> None:
+    stored = open_ply(save(tmp_path / "a.ply", columns(6)))[0].elements["vertex"].rows
+    save(tmp_path / "b.ply", columns(6)).replace(tmp_path / "a.ply")
+    with refuses(SceneError, "a.ply", "replaced"):
+        _ = stored[0:3]
 
 
 @pytest.mark.parametrize("kind", ["binary", "text", "packed"])
@@ -111,17 +104,6 @@ def test_bytes_after_any_of_several_parts_are_a_doubt(tmp_path: Path) -> None:
     assert any("100 bytes follow" in note for note in list_doubts(file_notes(read_parts(paths).info)))
 
 
-def resident_bytes(path: str) -> int:
-    """Count the bytes of a mapped file that are in this process's memory."""
-    total, inside = 0, False
-    for line in Path("/proc/self/smaps").read_text().splitlines():
-        if not line.split(":")[0].isalpha() and "-" in line.split()[0]:
-            inside = line.endswith(str(path))
-        elif inside and line.startswith("Rss:"):
-            total += 1024 * int(line.split()[1])
-    return total
-
-
 def test_counts_are_read_from_a_header(tmp_path: Path) -> None:
     assert header_counts(save(tmp_path / "a.ply", columns(7))) == (7, 0)
     assert header_counts(save(tmp_path / "b.ply", columns(9, num_rest=45))) == (9, 45)
@@ -134,7 +116,7 @@ def test_counts_are_read_from_a_header(tmp_path: Path) -> None:
         assert header_counts(tmp_path / "pipe.ply") == (0, 0)
 
 
-PLAIN, LINES = [b"property float x"] * 4, b"\n".join
+PLAIN, LINES = [b"property float " + name for name in (b"x", b"y", b"z", b"w")], b"\n".join
 
 
 @pytest.mark.parametrize(
