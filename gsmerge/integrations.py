@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from gsmerge.arrays import Array, as_array, like
 from gsmerge.errors import SceneError
 from gsmerge.geometry.transforms import rotmat_to_quat
 from gsmerge.kernels.matrices import eigh, invert
-from gsmerge.values.arrays import Array, as_array, like
 
 
 def depth_anything_3(prediction: Any, *, sh_degree: int = 0) -> dict[str, Any]:

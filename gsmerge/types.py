@@ -19,17 +19,8 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import numpy as np
 
-from gsmerge.values.arguments import check_fields
-from gsmerge.values.arrays import (
-    Array,
-    ArrayFields,
-    as_array,
-    as_index,
-    as_pictures,
-    as_tensor,
-    check_shape,
-    concat_rows,
-)
+from gsmerge.arrays import Array, ArrayFields, as_array, as_index, as_pictures, as_tensor, check_shape, concat_rows
+from gsmerge.runtime.arguments import check_fields
 
 if TYPE_CHECKING:
     import torch

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from zipfile import BadZipFile
 
-from gsmerge.errors import SceneError, UsageError
+from gsmerge.errors import SceneError, UsageError, count_words
 from gsmerge.io import SCENE_SUFFIXES
 from gsmerge.io.archives import open_archive
 from gsmerge.io.bounds import read_budget, read_lines
@@ -21,7 +21,6 @@ from gsmerge.io.image_names import natural_order
 from gsmerge.io.no_gaussians import find_remedy
 from gsmerge.io.scene_files import IMAGE_PLACES, PLY_PLACES, TRAINED_PLACES, list_plys, named_ply, other_plys
 from gsmerge.runtime.record import list_some
-from gsmerge.values.words import count_words
 
 NamedScene = tuple[Path, Path | None]  # a scene, and the named folder in which it is; None if the user named the scene
 MAX_FOLDERS = 100_000  # most folders in a row without a scene; a link into a system's folders leads to more

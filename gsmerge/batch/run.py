@@ -23,7 +23,7 @@ from gsmerge.batch.find import main_file
 from gsmerge.batch.jobs import DISTINGUISH, BatchOptions, Job
 from gsmerge.batch.records import DONE, FAILED, RECORDS, SKIPPED, DoneResult, RecordIndex, prepare_folder, record
 from gsmerge.compaction.outputs import name_outputs
-from gsmerge.errors import SceneError, error_line
+from gsmerge.errors import SceneError, count_words, error_line
 from gsmerge.io.atomic import atomic_output, describe_existing, remove_stale
 from gsmerge.io.jsonl import append_line
 from gsmerge.io.locks import lock_file
@@ -32,7 +32,6 @@ from gsmerge.runtime.memory import free_memory
 from gsmerge.runtime.processes import ProcessPool
 from gsmerge.runtime.threads import available_threads
 from gsmerge.runtime.work import SMALL_STORE, Call, Cluster, LostProcess, RayPool, WorkerPool
-from gsmerge.values.words import count_words
 
 FREE_MEMORY_SHARE = 0.8  # scenes that run at the same time may by default take this share of the free memory
 

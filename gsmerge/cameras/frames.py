@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from gsmerge.arrays import distinct
 from gsmerge.cameras.resection import projection_errors, refine_poses, start_pose
 from gsmerge.cameras.score import Correspondences
 from gsmerge.geometry.transforms import (
@@ -26,7 +27,6 @@ from gsmerge.geometry.transforms import (
 from gsmerge.kernels.elementary import arccos
 from gsmerge.kernels.matrices import invert, matmul, solve_symmetric, transform
 from gsmerge.types import Cameras
-from gsmerge.values.arrays import distinct
 
 _ROUNDS = 4  # number of rounds of reweighted least squares
 _HALF = np.sqrt(0.5)

@@ -11,12 +11,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import RunEnd, print_document, say, separate_stdout, terminal_columns, total_progress
-from gsmerge.errors import BatchError, Doubt, TargetError, UsageError
+from gsmerge.errors import BatchError, Doubt, TargetError, UsageError, count_words
 from gsmerge.settings.budget import AUTO
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.setting import Setting
 from gsmerge.settings.stages import Engine
-from gsmerge.values.words import count_words
 
 if TYPE_CHECKING:
     from gsmerge.batch import BatchOptions, Job

@@ -34,6 +34,7 @@ from gsmerge.io.scene_files import SceneFiles, scene_title
 from gsmerge.photos.row_colors import RENDERS
 from gsmerge.pipeline import build
 from gsmerge.plan import Plan, choose_blocks, make_plan
+from gsmerge.runtime.arguments import check_arguments
 from gsmerge.runtime.record import Progress, begin_part, expect_parts, note, record_part, record_run
 from gsmerge.runtime.threads import use_threads
 from gsmerge.scene.content_hash import doubt_changed
@@ -43,7 +44,6 @@ from gsmerge.scene.read import Loaded
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.types import Scene, StrPath
-from gsmerge.values.arguments import check_arguments
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

@@ -15,6 +15,7 @@ from gsmerge.compaction.files import with_output_name
 from gsmerge.compaction.methods import choose_method, is_without_views
 from gsmerge.compaction.outputs import Outputs
 from gsmerge.compaction.partition import gaussians_at_once
+from gsmerge.errors import count_words
 from gsmerge.facts.confirm_depths import confirm_depths
 from gsmerge.facts.counts import level_counts
 from gsmerge.facts.crop import crop_scene
@@ -32,7 +33,6 @@ from gsmerge.runtime.threads import available_threads, use_threads
 from gsmerge.scene.read import Loaded
 from gsmerge.settings.compact import OURS, CompactOptions
 from gsmerge.types import Scene
-from gsmerge.values.words import count_words
 
 MAX_SEARCHED_GAUSSIANS = (
     500_000  # most Gaussians of a scene without cameras for which the search is run; it takes seconds

@@ -9,12 +9,11 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from gsmerge.errors import Doubt, list_doubts
+from gsmerge.errors import Doubt, count_words, list_doubts
 from gsmerge.io.formats.arrays import ExpectedScores
 from gsmerge.measure.documents import document_head, note_entries, seconds_document, seconds_line, text_table, wrap_line
 from gsmerge.raster.metrics import psnr_figure, psnr_words
 from gsmerge.runtime.memory import human_bytes, human_share
-from gsmerge.values.words import count_words
 
 
 @dataclass(frozen=True)

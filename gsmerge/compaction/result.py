@@ -11,23 +11,23 @@ from weakref import ReferenceType, ref
 
 import numpy as np
 
+from gsmerge.arrays import to_float32
 from gsmerge.compaction.candidate import Candidate, rescore, with_moved_views
 from gsmerge.compaction.distance import describe_clear_loss, is_clearly_worse
 from gsmerge.compaction.outputs import name_outputs, write_outputs
 from gsmerge.compaction.placement import NUM_FULL, pad_harmonics
 from gsmerge.compaction.report import CompactReport, compared_psnr
 from gsmerge.compaction.scores import PartScores, measure_parts, score_input
+from gsmerge.errors import count_words
 from gsmerge.facts.prepare import Prepared
 from gsmerge.io.formats.arrays import result_comments
 from gsmerge.io.formats.table import Contents
 from gsmerge.photos.row_colors import OWN_PHOTOS, PHOTOS, RENDERS
 from gsmerge.plan import Plan, own_views
 from gsmerge.raster.metrics import SAMPLE_LOSS, describe_distance, describe_loss, is_worse
+from gsmerge.runtime.arguments import check_arguments
 from gsmerge.runtime.memory import peak_memory
 from gsmerge.types import Cameras, Gaussians, Scene, StrPath, make_scene, number_views
-from gsmerge.values.arguments import check_arguments
-from gsmerge.values.arrays import to_float32
-from gsmerge.values.words import count_words
 
 if TYPE_CHECKING:
     import torch

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from gsmerge.arrays import Array, as_array, to_float32
 from gsmerge.cameras import (
     check_pairs,
     choose_poses,
@@ -19,7 +20,7 @@ from gsmerge.cameras import (
 )
 from gsmerge.compaction.compact import compact
 from gsmerge.compaction.result import CompactResult
-from gsmerge.errors import SceneError
+from gsmerge.errors import SceneError, count_words
 from gsmerge.geometry.transforms import normalize, rgb_to_sh0
 from gsmerge.io.bounds import check_image_size
 from gsmerge.io.cameras.camera_file import (
@@ -36,8 +37,6 @@ from gsmerge.io.photo_files import photo_array
 from gsmerge.runtime.record import Progress
 from gsmerge.scene.input import TOLERANCE, check_numbers, check_poses, check_values
 from gsmerge.types import NO_CAMERAS, Cameras, Gaussians, Pixels, Scene
-from gsmerge.values.arrays import Array, as_array, to_float32
-from gsmerge.values.words import count_words
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

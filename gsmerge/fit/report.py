@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from gsmerge.arrays import ArrayFields
 from gsmerge.fit.outside import Outside
 from gsmerge.runtime.record import note, record_choices, report_progress
 from gsmerge.types import Cameras, Gaussians
-from gsmerge.values.arrays import ArrayFields
 
 SAMPLE_COST = 0.4  # time of a step on a quarter of the pixels, if one on all pixels takes 1; .3 to .6 on two captures
 HAZE = 0.05  # a result with more far fog gets a note, because a viewer shows such fog plainly

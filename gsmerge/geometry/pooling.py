@@ -7,12 +7,12 @@ from typing import Literal
 
 import numpy as np
 
+from gsmerge.arrays import to_float32
 from gsmerge.geometry.transforms import camera_depths
 from gsmerge.kernels.elementary import exp, log
 from gsmerge.kernels.gaussians.pool import decompose, pool
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Pixels, Scene
-from gsmerge.values.arrays import to_float32
 
 Rule = Literal["depth", "paper"]
 

@@ -12,13 +12,13 @@ from typing import TypeVar
 
 import numpy as np
 
+from gsmerge.arrays import Array
 from gsmerge.kernels.elementary import arctan2, cos, sin
 from gsmerge.kernels.gaussians.cross_view import make_tree, nearest_of_others
 from gsmerge.kernels.matrices import closest_rotation, invert, matmul, solve
 from gsmerge.kernels.raster.sh import view_colors
 from gsmerge.runtime.threads import parallel_map, use_threads
 from gsmerge.types import SH_C0, Cameras, Gaussians, Region, SceneT
-from gsmerge.values.arrays import Array
 
 DescentState = TypeVar("DescentState")  # state that a descent changes
 SH_DIRECTIONS = 96  # directions in which harmonics are compared before and after a rotation

@@ -31,6 +31,7 @@ from gsmerge.measure.documents import finite, note_entries, note_lines
 from gsmerge.photos.compare import compare_photos
 from gsmerge.plan import describe_share
 from gsmerge.raster.photos import LEAST_OPACITY
+from gsmerge.runtime.arguments import check_arguments
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.record import record_part, report_progress
 from gsmerge.runtime.threads import use_threads
@@ -42,7 +43,6 @@ from gsmerge.settings.reading import OpacityChoice
 from gsmerge.settings.setting import join_words
 from gsmerge.stages.sky import sky_regions
 from gsmerge.types import PicturedScene, Scene, StrPath
-from gsmerge.values.arguments import check_arguments
 
 _OWN = "gsmerge"  # exporter of files that gsmerge wrote
 _FILE_KEYS = (

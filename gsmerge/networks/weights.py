@@ -14,6 +14,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from gsmerge.arrays import Array
 from gsmerge.kernels.networks.layers import (
     GELU,
     PLAIN,
@@ -26,7 +27,6 @@ from gsmerge.kernels.networks.layers import (
     scratch_size,
 )
 from gsmerge.networks.options import NetworkOptions
-from gsmerge.values.arrays import Array
 
 Layer = tuple[np.ndarray, np.ndarray, int]  # packed weights, packed bias, and the number of outputs
 

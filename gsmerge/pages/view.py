@@ -21,11 +21,11 @@ from gsmerge.io.formats.read import GaussianFile, read_gaussians
 from gsmerge.io.scene_files import find_scene_files, scene_title
 from gsmerge.pages.data import collect_page_data
 from gsmerge.pages.page import headline, view_page
+from gsmerge.runtime.arguments import check_arguments
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.record import Progress, record_run
 from gsmerge.scene.input import as_scene
 from gsmerge.types import Gaussians, HasGaussians, Scene, StrPath, Views, own_gaussians
-from gsmerge.values.arguments import check_arguments
 
 NOTEBOOK_HEIGHT = 820  # height of a page in a notebook, pixels
 

@@ -9,13 +9,13 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
+from gsmerge.arrays import Array as AnyArray
+from gsmerge.arrays import ArrayFields, as_array
 from gsmerge.kernels.raster import blend as kernels
 from gsmerge.kernels.raster import sh
 from gsmerge.raster.tiled_view import Array, Splats, TiledView, make_splats, pieces, tile_ranges
 from gsmerge.runtime.threads import parallel_map, use_threads
 from gsmerge.types import Cameras, Gaussians
-from gsmerge.values.arrays import Array as AnyArray
-from gsmerge.values.arrays import ArrayFields, as_array
 
 
 def background_color(background: ArrayLike) -> Array:

@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 
+from gsmerge.arrays import Array, like
 from gsmerge.kernels.raster.project import TILE
 from gsmerge.raster.composite import Rendering, background_color, blend, draw_views, prepare_views, view_colors
 from gsmerge.raster.photos import NEAR_PLANE
 from gsmerge.raster.tiled_view import FAR_PLANE, TiledView, make_splats, tile_view
+from gsmerge.runtime.arguments import check_arguments
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians, Scene
-from gsmerge.values.arguments import check_arguments
-from gsmerge.values.arrays import Array, like
 
 # Scenes of more than ONE_AT_A_TIME Gaussians are tiled view by view, because a tiled view takes about as much memory as
 # the Gaussians

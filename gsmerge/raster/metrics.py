@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from gsmerge.arrays import Array, as_array
 from gsmerge.kernels.elementary import log10
 from gsmerge.kernels.pictures import compare_windows
-from gsmerge.values.arrays import Array, as_array
 
 WINDOW, SIGMA = 11, 1.5  # side of the windows of SSIM and their standard deviation, pixels
 INNER = (slice(WINDOW // 2, -(WINDOW // 2)), slice(WINDOW // 2, -(WINDOW // 2)))  # pixels that are centres of windows

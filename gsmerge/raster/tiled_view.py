@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from gsmerge.arrays import distinct
 from gsmerge.geometry.transforms import camera_centres, medians
 from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.raster import project as projection
 from gsmerge.kernels.raster.binning import count_tiles, deal_open_tiles, deal_tiles, depth_order
 from gsmerge.runtime.threads import parallel_map, use_threads
 from gsmerge.types import Gaussians
-from gsmerge.values.arrays import distinct
 
 Array = NDArray[Any]
 

@@ -10,7 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from gsmerge.errors import Doubt, SceneError, UsageError
+from gsmerge.errors import Doubt, SceneError, UsageError, count_words
 from gsmerge.io import SCENE_SUFFIXES, read_cameras
 from gsmerge.io.bounds import read_errors, walk_files
 from gsmerge.io.cameras.dataparser import DATAPARSER
@@ -18,7 +18,6 @@ from gsmerge.io.cameras.foreign import INTRINSICS
 from gsmerge.io.cameras.long_lrm import FRAMES_FILE
 from gsmerge.io.scene_files import SceneFiles
 from gsmerge.photos.scene_photos import find_photos
-from gsmerge.values.words import count_words
 
 EXTRA_FILES = (DATAPARSER, INTRINSICS, FRAMES_FILE)  # read with some camera files
 

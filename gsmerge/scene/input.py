@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from gsmerge.arrays import Array, as_array, check_numbers
 from gsmerge.errors import SceneError
 from gsmerge.io.cameras.camera_file import check_camera
 from gsmerge.runtime.record import note
 from gsmerge.scene.read import load_scene
 from gsmerge.types import Scene, StrPath
-from gsmerge.values.arrays import Array, as_array, check_numbers
 
 TOLERANCE = 1e-3  # opacities and images may lie outside [0, 1] by this much
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from gsmerge.cameras import AlignmentResult, align, check_pixels
-from gsmerge.errors import Doubt, DoubtWarning, Note, SceneError, name_notes, split_notes
+from gsmerge.errors import Doubt, DoubtWarning, Note, SceneError, count_words, name_notes, split_notes
 from gsmerge.geometry.transforms import move_views
 from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, to_cameras
 from gsmerge.io.cameras.dataparser import read_dataparser
@@ -41,6 +41,7 @@ from gsmerge.photos.scene_photos import (
     stored_photos,
     without_photo,
 )
+from gsmerge.runtime.arguments import check_arguments
 from gsmerge.runtime.record import list_some
 from gsmerge.runtime.threads import use_threads
 from gsmerge.scene.exporters import (
@@ -62,8 +63,6 @@ from gsmerge.scene.views import (
 )
 from gsmerge.settings.reading import NONE, OpacityChoice
 from gsmerge.types import NO_CAMERAS, Scene, StrPath
-from gsmerge.values.arguments import check_arguments
-from gsmerge.values.words import count_words
 
 MakeScene = Callable[[CameraFile, ScenePhotos], Loaded]  # may raise SceneError
 SUMMED_FACTS = ("file_bytes", "num_nonfinite")  # facts about files that are added up if scenes are joined

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from gsmerge.arrays import as_array
 from gsmerge.geometry.pooling import Members, feature_to_gaussians, pool_members, to_gaussians
 from gsmerge.kernels.gaussians.bisect import bisect, gather_groups, split_errors
 from gsmerge.networks.corrector import ANALYTIC, Corrector
@@ -16,7 +17,6 @@ from gsmerge.settings.stages import MIXED, MIXED_COUNTS, DecodeOptions
 from gsmerge.stages.merge import MergedViews
 from gsmerge.stages.superpixels import scene_saliency
 from gsmerge.types import Decoded, FeatureGaussians, Gaussians, PicturedScene
-from gsmerge.values.arrays import as_array
 
 GROUPS_PER_TASK = 8192  # number of groups that a thread divides at a time
 PLANE_WEIGHT = 1 / 16  # weight of squared distances from a child's plane, relative to squared differences of colour

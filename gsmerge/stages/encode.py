@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from gsmerge.arrays import to_float32
 from gsmerge.geometry.pooling import FOOTPRINT_ROWS, Members, Moments, Rule, pool_members
 from gsmerge.kernels.gaussians.pool import group_members
 from gsmerge.networks.corrector import ANALYTIC, Corrector
@@ -17,7 +18,6 @@ from gsmerge.networks.cross_view_stats import cross_view_stats
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, FeatureGaussians, Groups, Scene
-from gsmerge.values.arrays import to_float32
 
 if TYPE_CHECKING:
     from gsmerge.networks.weights import RunnableNetworks

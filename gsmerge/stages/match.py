@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from gsmerge.arrays import as_array, distinct
 from gsmerge.geometry.transforms import normalize
 from gsmerge.kernels.gaussians.cluster import connected_components, edge_scores, leader_clusters
 from gsmerge.networks.cross_view_stats import nearest_of_other_views
 from gsmerge.runtime.record import stage
 from gsmerge.settings.stages import MatchOptions
 from gsmerge.types import SH_C0, FeatureGaussians, Matches
-from gsmerge.values.arrays import as_array, distinct
 
 UPPER_TRIANGLE = [0, 1, 2, 4, 5, 8]  # entries xx xy xz yy yz zz of a flattened 3 x 3 covariance
 

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gsmerge.arrays import Array, as_tensor, to_float32
 from gsmerge.geometry.pooling import Members
 from gsmerge.networks.corrector import ANALYTIC, Corrector
 from gsmerge.runtime.record import stage
 from gsmerge.types import FeatureGaussians, Matches, Segmentation
-from gsmerge.values.arrays import Array, as_tensor, to_float32
 
 
 @dataclass(frozen=True, eq=False)

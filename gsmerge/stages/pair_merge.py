@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gsmerge.arrays import to_float32
 from gsmerge.geometry.pooling import FULL_MATRIX, MAX_OPACITY, principal_axes
 from gsmerge.kernels.elementary import log
 from gsmerge.kernels.elementary import power as power_of
@@ -19,7 +20,6 @@ from gsmerge.kernels.gaussians.pairs import CELL, agglomerate, gaussian_moments,
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Gaussians
-from gsmerge.values.arrays import to_float32
 
 # Chosen on training scenes by the PSNR of views from random cameras (docs/internals/notebook.md#bare-files)
 COLOR_WEIGHT = 0.6  # weight of squared differences of sh0 in a cost, whose other part is a divergence in nats

@@ -16,6 +16,7 @@ from functools import partial
 import cv2
 import numpy as np
 
+from gsmerge.arrays import Array, as_array, like
 from gsmerge.facts.counts import count_for
 from gsmerge.kernels.superpixels.kd import split_rectangles
 from gsmerge.kernels.superpixels.regions import pad_labels, refine
@@ -30,7 +31,6 @@ from gsmerge.kernels.superpixels.ward import merge_regions
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.stages import SegmentOptions
 from gsmerge.types import Groups
-from gsmerge.values.arrays import Array, as_array, like
 
 RECTANGLES, EARLY_SWEEPS = 2.0, 0  # defaults of rdseg: rectangles per superpixel, and sweeps before they are merged
 

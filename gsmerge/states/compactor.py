@@ -10,6 +10,7 @@ from gsmerge.compaction.compact import compact
 from gsmerge.compaction.result import CompactResult
 from gsmerge.errors import UsageError
 from gsmerge.io.formats.table import STATE_ENDING
+from gsmerge.runtime.arguments import check_arguments
 from gsmerge.runtime.record import Progress
 from gsmerge.scene.input import as_scene
 from gsmerge.settings.extend import batch_settings
@@ -18,7 +19,6 @@ from gsmerge.states.extend import BatchReport, extend
 from gsmerge.states.features import decode_features, extend_features
 from gsmerge.states.state_file import State, load_state, save_state
 from gsmerge.types import Gaussians, Scene, StrPath
-from gsmerge.values.arguments import check_arguments
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack

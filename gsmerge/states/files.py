@@ -12,7 +12,7 @@ from typing import Any
 
 from gsmerge.compaction.files import read_input
 from gsmerge.compaction.outputs import Outputs, write_outputs
-from gsmerge.errors import SceneError, UsageError
+from gsmerge.errors import SceneError, UsageError, count_words
 from gsmerge.io.atomic import common_mode
 from gsmerge.io.formats.arrays import result_comments
 from gsmerge.io.formats.rounding import format_notes
@@ -31,7 +31,6 @@ from gsmerge.states.compactor import extend_state
 from gsmerge.states.extend import BATCH
 from gsmerge.states.features import decode_features
 from gsmerge.states.state_file import State, load_state, save_state
-from gsmerge.values.words import count_words
 
 
 def extend_file(

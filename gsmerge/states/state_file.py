@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from gsmerge.errors import count_words
 from gsmerge.geometry.frame import Frame
 from gsmerge.io.cameras.camera_file import MAX_NUMBER, check_camera, check_size
 from gsmerge.io.formats.gsm import (
@@ -29,7 +30,6 @@ from gsmerge.networks.weights import NetworkWeights
 from gsmerge.scene.read import load_scene
 from gsmerge.states.features import FeatureState, ViewSamples
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Scene, StrPath
-from gsmerge.values.words import count_words
 
 FEATURE_COLUMNS = tuple(f.name for f in fields(FeatureGaussians) if f.name not in ("starts", "members", "views"))
 _MAX_MEMBERS = (1 << 40) - 1  # most Gaussians of a group; a larger number is damaged

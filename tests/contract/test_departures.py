@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from network_fixtures import made, noisy, untrained
 
+from gsmerge.arrays import as_array
 from gsmerge.networks.apply import encode_features
 from gsmerge.networks.checkpoint import IN_PACKAGE, load_checkpoint
 from gsmerge.networks.corrections import residual_limits
@@ -19,7 +20,6 @@ from gsmerge.settings.compact import RECIPES
 from gsmerge.settings.stages import DecodeOptions, SegmentOptions
 from gsmerge.stages.decode import decode
 from gsmerge.stages.superpixels import segment
-from gsmerge.values.arrays import as_array
 
 PAGE = Path(__file__).parents[2] / "docs" / "results.md"
 TITLE = "## Where the recipe departs from the paper"

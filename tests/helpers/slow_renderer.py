@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from gsmerge import Cameras, Gaussians
-from gsmerge.values.arrays import Array
+from gsmerge.arrays import Array
 
 torch = pytest.importorskip("torch", reason="torch is not installed")
 Tensor = torch.Tensor

@@ -16,6 +16,7 @@ from gsmerge.errors import (
     SceneError,
     TargetError,
     UsageError,
+    count_words,
     list_doubts,
     name_notes,
     split_notes,
@@ -57,3 +58,16 @@ def test_notes_of_other_processes_and_files_keep_what_they_are_about(change: Cal
     assert [(note.about, note.names) for note in changed if isinstance(note, Note)] == [
         ("columns", ("r",)), ("worse", ()), ("", ()),
     ]  # fmt: skip
+
+
+def test_count_of_one_is_singular() -> None:
+    numbers = 0, 1, 2, 1200
+    assert [count_words(number, "row") for number in numbers] == ["0 rows", "1 row", "2 rows", "1,200 rows"]
+
+
+def test_noun_that_ends_with_ch_takes_es() -> None:
+    assert count_words(2, "batch") == "2 batches"
+
+
+def test_words_behind_the_noun_stay_as_they_are() -> None:
+    assert count_words(1, "empty row", "set aside") == "1 empty row set aside"

@@ -11,8 +11,8 @@ import scenes
 
 import gsmerge
 from gsmerge import Scene
+from gsmerge.arrays import as_pictures
 from gsmerge.types import Views
-from gsmerge.values.arrays import as_pictures
 
 QUICK = {"effort": "draft", "fit": "none", "checkpoint": "none"}
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from messages import refuses
 
+from gsmerge.arrays import as_array, as_tensor, distinct, like
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Groups, Pixels, Scene, Views, make_scene
-from gsmerge.values.arrays import as_array, as_tensor, distinct, like
 
 
 def gaussians(n: int, coefficients: int = 0, start: int = 0) -> Gaussians:

@@ -11,11 +11,10 @@ from typing import Any
 import numpy as np
 
 from gsmerge.cameras.registration.register import register
-from gsmerge.errors import Doubt, SceneError
+from gsmerge.errors import Doubt, SceneError, count_words
 from gsmerge.geometry.transforms import Similarity, rotmat_to_quat
 from gsmerge.kernels.elementary import arccos
 from gsmerge.types import Cameras, Gaussians, LargePhotos, Pixels, Scene
-from gsmerge.values.words import count_words
 
 
 @dataclass(frozen=True)

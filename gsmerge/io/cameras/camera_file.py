@@ -15,9 +15,9 @@ from gsmerge.geometry.transforms import Similarity, pose_changes
 from gsmerge.io.bounds import MAX_VIEWS, check_image_size
 from gsmerge.io.photo_files import PhotoArrays, PhotoTransform, Size, change_photos, photo_size, same_shape
 from gsmerge.kernels.matrices import determinant, invert, matmul
+from gsmerge.runtime.arguments import check_arguments
 from gsmerge.settings.reading import Order
 from gsmerge.types import Cameras, StrPath
-from gsmerge.values.arguments import check_arguments
 
 # Largest number in poses and intrinsics, largest side of an image, and smallest focal length, in pixels. Cameras beyond
 # these three limits are not real, and their numbers would overflow in later steps

@@ -14,9 +14,9 @@ from gsmerge.io.cameras.foreign import CAMERA_PLACES, INTRINSICS, check_program
 from gsmerge.io.cameras.table import CAMERA_ENDINGS, CAMERA_FORMATS, KEYFRAME, SHARP_PLY, is_colmap, is_keyframes
 from gsmerge.io.cameras.viewer_cameras import ENDING
 from gsmerge.io.image_names import natural_order
+from gsmerge.runtime.arguments import check_arguments
 from gsmerge.runtime.plugins import lazy_functions
 from gsmerge.types import StrPath
-from gsmerge.values.arguments import check_arguments
 
 _lazy = lazy_functions(__package__)
 holds_images = _lazy("npz_files.holds_images")

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gsmerge.arrays import Array, as_array
 from gsmerge.errors import Doubt, SceneError
 from gsmerge.geometry.transforms import (
     apply_harmonics_rotation,
@@ -23,7 +24,6 @@ from gsmerge.io.bounds import ReadBudget, read_errors
 from gsmerge.kernels.elementary import log
 from gsmerge.kernels.matrices import matmul
 from gsmerge.types import Gaussians
-from gsmerge.values.arrays import Array, as_array
 
 MAX_POSITION = 1e13  # no scene is larger, in any unit; squares and sums of such positions are finite in float32
 BLOCK_ROWS = 1 << 16  # rows that are converted at a time

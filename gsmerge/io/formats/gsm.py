@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from safetensors.numpy import save
 
+from gsmerge.arrays import as_array
 from gsmerge.errors import SceneError
 from gsmerge.io.atomic import atomic_output
 from gsmerge.io.bounds import check_image_size, parse_json, read_budget
@@ -27,7 +28,6 @@ from gsmerge.io.formats.arrays import Columns, Packed, StoredRows, check_gaussia
 from gsmerge.io.tensor_file import read_tensors
 from gsmerge.kernels.elementary import log
 from gsmerge.types import Cameras, Gaussians, Scene, StrPath
-from gsmerge.values.arrays import as_array
 from gsmerge.version import __version__
 
 SCHEMA = 3  # version of the whole file; gsmerge 0.3.0 and earlier wrote lower versions

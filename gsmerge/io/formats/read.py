@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from gsmerge.errors import Doubt, Note, SceneError
+from gsmerge.errors import Doubt, Note, SceneError, count_words
 from gsmerge.geometry.transforms import lower_median, rgb_to_sh0
 from gsmerge.io.formats import arrays, ply
 from gsmerge.io.formats.arrays import StoredRows
@@ -18,12 +18,11 @@ from gsmerge.io.formats.scale_units import LINEAR_NOTE, are_scales_linear, with_
 from gsmerge.io.formats.table import META, PLY, READ_ENDINGS, find_format
 from gsmerge.kernels.elementary import exp
 from gsmerge.kernels.stored_rows import convert_rows
+from gsmerge.runtime.arguments import check_arguments
 from gsmerge.runtime.memory import free_pages, make_array
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.reading import ColorChoice, OpacityChoice, ScaleChoice
 from gsmerge.types import Gaussians, StrPath
-from gsmerge.values.arguments import check_arguments
-from gsmerge.values.words import count_words
 
 MAX_HARMONIC = 1e6  # no scene has larger harmonics; squares and sums of such renders are finite in float32
 FREED_ROWS = 1 << 17  # number of converted rows after which the memory of large columns is freed

@@ -8,12 +8,12 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from gsmerge.arrays import distinct
 from gsmerge.geometry.transforms import medians
 from gsmerge.io.formats.read import read_gaussians
 from gsmerge.io.formats.table import PLY, output_format
 from gsmerge.io.formats.write import limit_notes, write_gaussians
 from gsmerge.types import Gaussians, StrPath
-from gsmerge.values.arrays import distinct
 
 # Limit of the mean square of the distances by which rounding moves Gaussians. Above the limit, renders change visibly;
 # at the limit, a PSNR of 27 dB drops by .05 dB. A distance is divided by the Gaussian's size, and a quotient above 1

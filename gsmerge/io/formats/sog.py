@@ -24,6 +24,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from gsmerge.arrays import to_float32
 from gsmerge.errors import SceneError
 from gsmerge.io.archives import new_member, open_archive, read_member
 from gsmerge.io.bounds import (
@@ -40,7 +41,6 @@ from gsmerge.io.formats import arrays
 from gsmerge.io.formats.table import META
 from gsmerge.kernels.elementary import expm1, log1p
 from gsmerge.types import Gaussians
-from gsmerge.values.arrays import to_float32
 
 MAX_DEGREE = 3  # of harmonics, the highest of the format
 VERSION = 2  # of the format, as its metadata states it

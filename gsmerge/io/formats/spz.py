@@ -25,13 +25,13 @@ from typing import cast
 
 import numpy as np
 
+from gsmerge.arrays import as_array, to_float32
 from gsmerge.errors import SceneError
 from gsmerge.geometry.transforms import rgb_to_sh0
 from gsmerge.io.bounds import ReadBudget, check_file, read_errors
 from gsmerge.io.formats import arrays
 from gsmerge.io.formats.table import Contents
 from gsmerge.types import SH_C0, Gaussians, StrPath
-from gsmerge.values.arrays import as_array, to_float32
 
 # Default version and largest degree of harmonics of written files. Spark 2.2 does not read version 4 of the format, and
 # old readers read only version 2

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from gsmerge.errors import SceneError, UsageError
+from gsmerge.errors import SceneError, UsageError, count_words
 from gsmerge.io.atomic import AddOutput, atomic_outputs
 from gsmerge.io.bounds import ReadBudget, check_file, check_whole, read_json
 from gsmerge.io.formats import arrays, sog
@@ -29,9 +29,8 @@ from gsmerge.io.formats.read import GaussianFile, convert_stored
 from gsmerge.io.formats.splat_transform import blame_program, run_program
 from gsmerge.io.formats.table import INDEX, Contents
 from gsmerge.io.formats.write import write_ply
+from gsmerge.runtime.arguments import check_arguments
 from gsmerge.types import Gaussians, StrPath
-from gsmerge.values.arguments import check_arguments
-from gsmerge.values.words import count_words
 
 VERSION = 1  # of the format, as the index states it
 MAX_DEGREE = sog.MAX_DEGREE

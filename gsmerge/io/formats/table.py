@@ -11,6 +11,7 @@ from typing import Literal
 
 import numpy as np
 
+from gsmerge.arrays import to_float32
 from gsmerge.errors import UsageError
 from gsmerge.io.atomic import AddOutput
 from gsmerge.io.formats import ply
@@ -20,7 +21,6 @@ from gsmerge.runtime.plugins import lazy_functions
 from gsmerge.settings.files import FileOptions
 from gsmerge.settings.setting import join_words
 from gsmerge.types import NO_CAMERAS, Cameras, Gaussians, StrPath
-from gsmerge.values.arrays import to_float32
 
 STATE_ENDING = ".gsm"  # ending of states, which gsmerge extend writes
 INDEX = "lod-meta.json"  # name of a Streamed SOG, by which viewers recognise it

@@ -11,8 +11,8 @@ import numpy as np
 from gsmerge.io.atomic import AddOutput, atomic_output
 from gsmerge.io.formats import ply
 from gsmerge.io.formats.table import OUTPUT_FORMATS, PLY, Contents, output_format
+from gsmerge.runtime.arguments import check_arguments
 from gsmerge.types import Gaussians, StrPath
-from gsmerge.values.arguments import check_arguments
 
 
 def limit_notes(path: StrPath, sh_degree: int, count: int) -> list[str]:

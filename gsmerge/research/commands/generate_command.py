@@ -8,10 +8,9 @@ from typing import Annotated
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import print_document, stage_progress
 from gsmerge.cli.render_command import parse_size
-from gsmerge.errors import SceneError
+from gsmerge.errors import SceneError, count_words
 from gsmerge.runtime.plugins import LazyFunction
 from gsmerge.settings.setting import Setting, Settings, setting
-from gsmerge.values.words import count_words
 
 PANEL = "Scenes"
 OPTIONS = LazyFunction("gsmerge.research.generate", "GenerateOptions")

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import scaled_dot_product_attention
 
+from gsmerge.arrays import Array, as_array, as_tensor
 from gsmerge.networks.options import (
     FEATURE,
     GROUP_COLUMNS,
@@ -26,7 +27,6 @@ from gsmerge.networks.options import (
     NetworkOptions,
 )
 from gsmerge.networks.weights import NetworkWeights
-from gsmerge.values.arrays import Array, as_array, as_tensor
 
 
 def mlp(*widths: int) -> nn.Sequential:

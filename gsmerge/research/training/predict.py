@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from gsmerge.arrays import Array, as_array, as_tensor
 from gsmerge.geometry.pooling import MAX_OPACITY, Members, principal_axes
 from gsmerge.networks.apply import NetworkContext, prepare_children, run_heads
 from gsmerge.networks.corrections import (
@@ -44,7 +45,6 @@ from gsmerge.stages.decode import divide_groups
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import cluster_runs, merge, pool_runs, take_features
 from gsmerge.types import SH_C0, FeatureGaussians, Gaussians, Matches
-from gsmerge.values.arrays import Array, as_array, as_tensor
 
 TINY = 1e-12  # least length whose logarithm is taken, world units
 CONSTANT = slice(6, 8)  # columns of ``group`` without a gradient: log of the number of members, and their mean weight

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from network_fixtures import SMALL, Made, made, noisy, untrained
 
+from gsmerge.arrays import as_array
 from gsmerge.geometry.pooling import feature_to_gaussians
 from gsmerge.geometry.transforms import covariances
 from gsmerge.networks.apply import NetworkContext, decode_gaussians, encode_features, find_neighbors, run_heads
@@ -20,7 +21,6 @@ from gsmerge.stages.decode import decode, divide_groups
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import merge, take_features
 from gsmerge.types import FeatureGaussians, Gaussians, Matches
-from gsmerge.values.arrays import as_array
 
 PAPER = replace(SMALL, outputs="absolute", merger_start="first", geometry="carried", group_numbers=False)
 

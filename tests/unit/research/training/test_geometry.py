@@ -13,6 +13,7 @@ from scenes import arc, make_scene, room
 from sweeps import sweep
 from training_runs import PAPER, TINY, noisy_networks, torch, whole_photo
 
+from gsmerge.arrays import as_array
 from gsmerge.geometry.pooling import feature_to_gaussians
 from gsmerge.networks import apply, tokens
 from gsmerge.networks.apply import NetworkContext, encode_features
@@ -40,7 +41,6 @@ from gsmerge.research.training.windows import Crop
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import cluster_runs, pool_runs
 from gsmerge.types import FeatureGaussians, Matches
-from gsmerge.values.arrays import as_array
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 COLUMNS = {

@@ -1,1 +1,0 @@
-"""Values of arguments and messages: arrays or tensors, checks, words."""
