@@ -24,7 +24,7 @@ from captures import make_frame
 
 from gsmerge.geometry.transforms import project_points
 from gsmerge.io.cameras.camera_file import CameraFile
-from gsmerge.io.cameras.read import find_cameras, read_cameras
+from gsmerge.io.cameras.read_cameras import find_cameras, read_cameras
 from gsmerge.io.image_names import natural_key
 
 SIDE, MULTIPLE = 480, 32  # longer side of photos, and the divisor of both sides, pixels

@@ -44,7 +44,7 @@ from PIL import Image
 import gsmerge
 from gsmerge.io.bounds import read_json
 from gsmerge.kernels.pictures import turn_back
-from gsmerge.scene.read import load_scene
+from gsmerge.reading.read_scene import load_scene
 
 TAGS = {0: 1, 2: 3, 3: 6, 1: 8}  # orientation tag of EXIF for each number of quarter turns
 SAME = 0.02  # mean difference of colours up to which two pictures show the same photo, with the losses of JPEG

@@ -172,7 +172,7 @@ def _settings_page() -> str:
 
 def _exporters_page(page: str) -> str:
     """Return the page of exporters with a new list of models, by what a run does with their output."""
-    from gsmerge.scene.exporters import EXPORTERS
+    from gsmerge.reading.exporters import EXPORTERS
 
     results: dict[str, list[str]] = {}
     for exporter in EXPORTERS.values():

@@ -37,7 +37,7 @@ VIEW, X, Y = 1, 38, 28  # the pixel that the page follows
 ROW = (VIEW * HEIGHT + Y) * WIDTH + X  # row of this pixel's Gaussian
 LINE = 120  # most characters of a line of the page
 WATCHED = {  # functions that are recorded, by the module that calls them
-    "gsmerge.scene.read": ("align",),
+    "gsmerge.reading.read_scene": ("align",),
     "gsmerge.compaction.compact": ("make_plan", "build", "make_result"),
     "gsmerge.pipeline": ("segment_scene", "correct", "match", "merge", "decode_merged", "fit_scene"),
 }
@@ -239,8 +239,8 @@ def align_section(run: Run) -> str:
     return "\n\n".join([
         "## 1. align: which row is which pixel",
         text(
-            "[`cameras/rows_first.py`](../../gsmerge/cameras/rows_first.py) gets the rows, the cameras and the",
-            "photos, and returns the pixel of every row if the rows show it.",
+            "[`align_rows.py`](../../gsmerge/reading/alignment/align_rows.py) gets rows, cameras and photos,",
+            "and returns the pixel of every row if the rows show it.",
         ),
         "\n".join([
             entry("ply.gaussians.means", ply.gaussians.means, ROW),

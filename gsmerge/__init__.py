@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from gsmerge.pages.view import view as view
     from gsmerge.raster import Rendering as Rendering
     from gsmerge.raster import render as render
-    from gsmerge.scene.read import read_scene as read_scene
+    from gsmerge.reading.read_scene import read_scene as read_scene
     from gsmerge.settings.compact import CompactOptions as CompactOptions
     from gsmerge.settings.evaluate import EvaluateOptions as EvaluateOptions
     from gsmerge.stages.superpixels import saliency as saliency
@@ -63,7 +63,7 @@ _PUBLIC = {
     "pages.view": ("view",),
     "states.compactor": ("Compactor",),
     "raster": ("Rendering", "render"),
-    "scene.read": ("read_scene",),
+    "reading.read_scene": ("read_scene",),
     "settings.compact": ("CompactOptions",),
     "settings.evaluate": ("EvaluateOptions",),
     "stages.superpixels": ("saliency", "superpixels"),

@@ -20,8 +20,8 @@ from gsmerge.facts.counts import CountLimits, FileSize, count_limits, file_size,
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.scene_size import SceneSize
 from gsmerge.fit import photo_scale, start_share
+from gsmerge.geometry.views import REPORT_VIEWS, pick_views, scored_views
 from gsmerge.photos.row_colors import RENDERS
-from gsmerge.photos.views import REPORT_VIEWS, pick_views, scored_views
 from gsmerge.raster.photos import scored_tiles
 from gsmerge.runtime.record import note, stage
 from gsmerge.settings.budget import AUTO

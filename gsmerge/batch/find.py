@@ -17,9 +17,9 @@ from gsmerge.io.bounds import read_budget, read_lines
 from gsmerge.io.cameras.foreign import CAMERA_PLACES
 from gsmerge.io.formats.ply import header_content
 from gsmerge.io.formats.table import STATE_ENDING, may_hold_gaussians
-from gsmerge.io.image_names import natural_order
+from gsmerge.io.image_names import IMAGE_PLACES, natural_order
 from gsmerge.io.no_gaussians import find_remedy
-from gsmerge.io.scene_files import IMAGE_PLACES, PLY_PLACES, TRAINED_PLACES, list_plys, named_ply, other_plys
+from gsmerge.reading.scene_files import PLY_PLACES, TRAINED_PLACES, list_plys, named_ply, other_plys
 from gsmerge.runtime.record import list_some
 
 NamedScene = tuple[Path, Path | None]  # a scene, and the named folder in which it is; None if the user named the scene

@@ -16,12 +16,12 @@ from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import OUTPUT_FORMATS
 from gsmerge.io.formats.table import estimate_counts
 from gsmerge.io.formats.write import level_output
-from gsmerge.io.scene_files import SceneFiles, find_scene_files
 from gsmerge.measure.documents import SCHEMA_VERSION, file_sha256
 from gsmerge.networks.checkpoint import load_checkpoint
+from gsmerge.reading.content_hash import content_hash, digest, fill_template, list_files, scene_name
+from gsmerge.reading.scene_files import SceneFiles, find_scene_files
 from gsmerge.runtime.memory import memory_bytes
 from gsmerge.runtime.record import list_some
-from gsmerge.scene.content_hash import content_hash, digest, fill_template, list_files, scene_name
 from gsmerge.settings.budget import AUTO
 from gsmerge.settings.compact import CHECKPOINTS, CompactOptions
 from gsmerge.settings.reading import NONE, OpacityChoice, ReadHints

@@ -14,8 +14,8 @@ from gsmerge.settings.evaluate import NETS, EvaluateOptions
 
 if TYPE_CHECKING:
     from gsmerge.io import GaussianFile
-    from gsmerge.io.scene_files import SceneFiles
-    from gsmerge.scene.read import Loaded
+    from gsmerge.reading.read_scene import Loaded
+    from gsmerge.reading.scene_files import SceneFiles
     from gsmerge.types import Cameras, Gaussians, Scene, Views
 
 
@@ -51,7 +51,7 @@ class BeforeAfter:
     @property
     def title(self) -> str:
         """Name of the scene."""
-        from gsmerge.io.scene_files import scene_title
+        from gsmerge.reading.scene_files import scene_title
 
         return scene_title(self.load.files.ply)
 
@@ -71,9 +71,9 @@ def read_before_after(
     """
     from gsmerge.facts.place_cameras import NO_VIEWS, PLACED_VIEWS, add_views
     from gsmerge.io import read_gaussians
-    from gsmerge.io.scene_files import result_cameras
+    from gsmerge.reading.read_scene import load_files
+    from gsmerge.reading.scene_files import result_cameras
     from gsmerge.runtime.record import record_run
-    from gsmerge.scene.read import load_files
 
     if files.cameras is None and "cameras" not in files.named:  # a result may have cameras although its scene has none
         files = replace(files, cameras=next(filter(None, map(result_cameras, after)), None))
@@ -103,8 +103,8 @@ def own_cameras(paths: Sequence[Path], scene: Scene) -> tuple[dict[str, Cameras]
 
     from gsmerge.geometry.frame import scene_depth
     from gsmerge.io.cameras.camera_file import describe_moves, list_moves
-    from gsmerge.io.cameras.read import read_cameras
-    from gsmerge.io.scene_files import result_cameras
+    from gsmerge.io.cameras.read_cameras import read_cameras
+    from gsmerge.reading.scene_files import result_cameras
 
     cameras: dict[str, Cameras] = {}
     notes, start = list[str](), scene.cameras.viewmats
@@ -142,8 +142,8 @@ def held_out_views(
 
     With ``views``, only the held-out views between the chosen views are returned.
     """
-    from gsmerge.photos.views import even_views, midpoint_views, subset
-    from gsmerge.scene.held_out import read_held_out
+    from gsmerge.geometry.views import even_views, midpoint_views, subset
+    from gsmerge.reading.held_out import read_held_out
 
     if target_images is not None and targets is None:
         raise UsageError("--target-images: expected the cameras of these photos too; name them with --targets")

@@ -22,8 +22,8 @@ from gsmerge.settings.stages import Engine
 
 if TYPE_CHECKING:
     from gsmerge.compaction.outputs import Outputs
-    from gsmerge.io.scene_files import SceneFiles
-    from gsmerge.scene.read import Loaded
+    from gsmerge.reading.read_scene import Loaded
+    from gsmerge.reading.scene_files import SceneFiles
 
 SETTINGS = (CompactOptions, FileOptions, Engine)
 REMEDY = "more Gaussians (--k, --budget) or a longer fit (--effort) show them better"
@@ -138,7 +138,7 @@ def _show_page(on_page: Sequence[Path], loaded: "Loaded | None", run: Run, *, op
     """Show the result on a page, beside the scene that was ``loaded`` if ``on_page`` has both."""
     from gsmerge.cli.view_command import show_page
     from gsmerge.io.formats.table import VIEWED
-    from gsmerge.io.scene_files import find_scene_files
+    from gsmerge.reading.scene_files import find_scene_files
 
     if run.out.suffix.lower() not in VIEWED:
         return
@@ -260,7 +260,7 @@ def _find_features(scenes: Sequence[Path]) -> Path | None:
 
 def _find_files(scenes: Sequence[Path], output: Path | None, cameras: Any, **named: Any) -> "SceneFiles":
     """Find the files of a scene, and of further scenes to join with it: those named, or those beside each scene."""
-    from gsmerge.io.scene_files import find_scene_files
+    from gsmerge.reading.scene_files import find_scene_files
 
     if len(scenes) > 1:
         _check_scenes(scenes, output, cameras)

@@ -39,7 +39,7 @@ def convert(
     if not inputs:
         remedy = f"name the output last, as in gsmerge convert {output} x.spz"
         raise UsageError(f"expected files to read and one to write, got only {output}; {remedy}")
-    from gsmerge.io.scene_files import find_plys
+    from gsmerge.reading.scene_files import find_plys
 
     inputs = [file for path in inputs for file in (find_plys(path) if path.is_dir() else [path])]
     writing, cleaning, placement = given.make(*SETTINGS)

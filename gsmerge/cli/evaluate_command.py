@@ -38,7 +38,7 @@ def evaluate(
     progress: opt.Progress = None, quiet: opt.Quiet = False,
 ) -> None:  # fmt: skip
     """Measure a scene and its compact versions against photos: PSNR, SSIM, LPIPS, fog, counts, bytes, render time."""
-    from gsmerge.io.scene_files import find_scene_files
+    from gsmerge.reading.scene_files import find_scene_files
 
     nets, lpips_notes = lpips_networks(lpips)
     given, reading, silent = opt.read_settings(SETTINGS, set, lpips=lpips), opt.read_hints(hint), quiet or json

@@ -26,7 +26,7 @@ def extend(
 ) -> None:  # fmt: skip
     """Compact new views and add them to a state, from which gsmerge compact makes a result at any time."""
     from gsmerge.io.formats.table import STATE_ENDING
-    from gsmerge.io.scene_files import find_scene_files
+    from gsmerge.reading.scene_files import find_scene_files
 
     start = perf_counter()
     if state.suffix.lower() != STATE_ENDING:

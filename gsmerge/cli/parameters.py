@@ -113,7 +113,7 @@ class Reading(NamedTuple):
 
 def read_hints(pairs: Iterable[str] | None, **defaults: Any) -> Reading:
     """Read ``--hint``: how the file stores opacities, and how to read the scene. ``defaults`` are other hints."""
-    from gsmerge.scene.exporters import find_exporter
+    from gsmerge.reading.exporters import find_exporter
 
     declared = flat_settings(FileHints)
     texts = split_pairs("--hint", pairs or (), declared)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from gsmerge.errors import SceneError, UsageError
 
 if TYPE_CHECKING:
-    from gsmerge.io.scene_files import SceneFiles
+    from gsmerge.reading.scene_files import SceneFiles
 
 
 def default_output(ply: Path) -> Path:
@@ -36,7 +36,7 @@ def check_outputs(
     ``reports``: the outputs are reports. Reports replace reports of gsmerge, and no other files, whatever ``overwrite``
     is. Raises SceneError if an output cannot be written. Missing folders are not made here.
     """
-    from gsmerge.io.cameras.read import find_cameras
+    from gsmerge.io.cameras.read_cameras import find_cameras
 
     paths = [path for path in inputs if path is not None]
     camera_files = [cameras for path in paths if path.is_dir() and (cameras := find_cameras(path)) is not None]

@@ -69,10 +69,10 @@ def render(
     """Draw scenes: a clip of before and after, a panel with the photos, or a picture for each camera."""
     kind = _choose_kind(output, scenes, path, frames, views)
     path = path or ("orbit" if kind == "path" else None)
-    from gsmerge.io.scene_files import find_scene_files
     from gsmerge.measure import drawings
     from gsmerge.measure.camera_path import parse_camera_path
     from gsmerge.measure.documents import document_head, note_entries
+    from gsmerge.reading.scene_files import find_scene_files
 
     files = find_scene_files(scenes[0], cameras=cameras, images=images)
     framing = drawings.frame_files(files, cameras, images)

@@ -11,8 +11,8 @@ from gsmerge.cli.console import print_document, say, say_notes, stage_progress
 from gsmerge.cli.paths import check_outputs, input_files, write_texts
 
 if TYPE_CHECKING:
-    from gsmerge.io.scene_files import SceneFiles
-    from gsmerge.scene.read import Loaded
+    from gsmerge.reading.read_scene import Loaded
+    from gsmerge.reading.scene_files import SceneFiles
 
 
 def view(
@@ -30,7 +30,7 @@ def view(
     progress: opt.Progress = None, quiet: opt.Quiet = False,
 ) -> None:  # fmt: skip
     """Show a scene, alone or beside its compact versions, in the browser: photos, stills, 3D and scores in one file."""
-    from gsmerge.io.scene_files import find_scene_files
+    from gsmerge.reading.scene_files import find_scene_files
 
     files, reading = find_scene_files(before, cameras=cameras, images=images, masks=masks), opt.read_hints(hint)
     show_page(

@@ -29,7 +29,7 @@ from gsmerge.facts.counts import file_size
 from gsmerge.facts.scene_size import SceneSize
 from gsmerge.fit import fit_scene, peak_weights
 from gsmerge.geometry.frame import Frame, scene_frame
-from gsmerge.photos.views import subset
+from gsmerge.geometry.views import subset
 from gsmerge.plan import WHOLE_GAUSSIANS, Plan, plan_scene
 from gsmerge.raster.photos import blank_photos
 from gsmerge.runtime.memory import free_pages, memory_bytes

@@ -27,20 +27,20 @@ from gsmerge.facts.crop import crop_scene
 from gsmerge.facts.prepare import Prepared
 from gsmerge.facts.scene_size import measure_size
 from gsmerge.io import atomic_outputs
-from gsmerge.io.formats.arrays import result_comments
 from gsmerge.io.formats.rounding import format_notes
+from gsmerge.io.formats.rows import result_comments
 from gsmerge.io.formats.table import Contents
-from gsmerge.io.scene_files import SceneFiles, scene_title
 from gsmerge.photos.row_colors import RENDERS
 from gsmerge.pipeline import build
 from gsmerge.plan import Plan, choose_blocks, make_plan
+from gsmerge.reading.content_hash import doubt_changed
+from gsmerge.reading.exporters import NO_HINTS, ReadHints
+from gsmerge.reading.input import as_scene
+from gsmerge.reading.read_scene import Loaded
+from gsmerge.reading.scene_files import SceneFiles, scene_title
 from gsmerge.runtime.arguments import check_arguments
 from gsmerge.runtime.record import Progress, begin_part, expect_parts, note, record_part, record_run
 from gsmerge.runtime.threads import use_threads
-from gsmerge.scene.content_hash import doubt_changed
-from gsmerge.scene.exporters import NO_HINTS, ReadHints
-from gsmerge.scene.input import as_scene
-from gsmerge.scene.read import Loaded
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.types import Scene, StrPath

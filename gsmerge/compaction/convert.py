@@ -19,14 +19,14 @@ from gsmerge.geometry.frame import scene_frame
 from gsmerge.io import GaussianFile, file_notes, read_cameras, read_gaussians
 from gsmerge.io.cameras.camera_file import CameraFile, to_cameras
 from gsmerge.io.cameras.viewer_cameras import viewer_cameras_path
-from gsmerge.io.formats.arrays import RESULT_COMMENT, result_comments, states_vertical_axis, upward_axis
 from gsmerge.io.formats.extra_columns import describe_extra_columns, join_extra_columns, read_extra_columns
-from gsmerge.io.formats.read import FileInfo, kept_comments
+from gsmerge.io.formats.read_gaussians import FileInfo, kept_comments
 from gsmerge.io.formats.rounding import format_notes
+from gsmerge.io.formats.rows import RESULT_COMMENT, result_comments, states_vertical_axis, upward_axis
 from gsmerge.io.formats.table import Contents, Format
 from gsmerge.io.photo_files import read_images
-from gsmerge.io.scene_files import find_scene_files, named_path, result_cameras, scene_title
 from gsmerge.measure.documents import document_head, note_entries
+from gsmerge.reading.scene_files import find_scene_files, named_path, result_cameras, scene_title
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.record import report_progress
 from gsmerge.runtime.threads import use_threads

@@ -27,10 +27,10 @@ from gsmerge.io.formats.table import find_format
 from gsmerge.measure.coverage import shares_inside
 from gsmerge.measure.documents import document_head, note_entries, note_lines
 from gsmerge.plan import FIDELITY_LOSS, FIDELITY_PSNR, choose_blocks, load_networks, plan_scene, resolve_budget
+from gsmerge.reading.read_scene import Loaded
 from gsmerge.runtime.memory import human_bytes, memory_bytes, memory_problem
 from gsmerge.runtime.record import record_part, record_run
 from gsmerge.runtime.threads import available_threads, use_threads
-from gsmerge.scene.read import Loaded
 from gsmerge.settings.compact import OURS, CompactOptions
 from gsmerge.types import Scene
 

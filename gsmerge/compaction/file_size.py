@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from gsmerge.compaction.candidate import Candidate, build_candidate, rescore
 from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import Prepared
-from gsmerge.io.formats.arrays import MIP_COMMENT, RESULT_COMMENT
+from gsmerge.io.formats.rows import MIP_COMMENT, RESULT_COMMENT
 from gsmerge.io.formats.table import Contents, Format
 from gsmerge.plan import Plan
 from gsmerge.runtime.memory import human_bytes

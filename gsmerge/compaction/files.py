@@ -6,15 +6,15 @@ from dataclasses import replace
 
 from gsmerge.compaction.outputs import Outputs
 from gsmerge.errors import SceneError, split_notes
-from gsmerge.io.formats.arrays import RESULT_COMMENT
 from gsmerge.io.formats.columns import list_names
 from gsmerge.io.formats.ply import is_from_gsmerge
-from gsmerge.io.scene_files import SceneFiles, result_cameras
+from gsmerge.io.formats.rows import RESULT_COMMENT
 from gsmerge.measure.documents import file_sha256
+from gsmerge.reading.content_hash import list_changed, read_stats
+from gsmerge.reading.exporters import NO_HINTS, ReadHints
+from gsmerge.reading.read_scene import Loaded, load_files
+from gsmerge.reading.scene_files import SceneFiles, result_cameras
 from gsmerge.runtime.memory import release_memory
-from gsmerge.scene.content_hash import list_changed, read_stats
-from gsmerge.scene.exporters import NO_HINTS, ReadHints
-from gsmerge.scene.read import Loaded, load_files
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.types import Scene

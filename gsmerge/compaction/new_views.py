@@ -16,8 +16,8 @@ from gsmerge.compaction.left_out import LEAST_SEEN, choose_left_out, leave_out, 
 from gsmerge.compaction.report import CompactReport, NewViews, compared_psnr
 from gsmerge.facts.prepare import Prepared
 from gsmerge.geometry.transforms import camera_distances
+from gsmerge.geometry.views import subset
 from gsmerge.kernels.elementary import power
-from gsmerge.photos.views import subset
 from gsmerge.pipeline import build
 from gsmerge.plan import Plan
 from gsmerge.raster.photos import shrink_pictures

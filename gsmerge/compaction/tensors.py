@@ -9,15 +9,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gsmerge.arrays import Array, as_array, to_float32
-from gsmerge.cameras import (
-    check_pairs,
-    choose_poses,
-    explain_misalignment,
-    misalignment_error,
-    move_cameras,
-    other_conventions,
-    sample_pixels,
-)
 from gsmerge.compaction.compact import compact
 from gsmerge.compaction.result import CompactResult
 from gsmerge.errors import SceneError, count_words
@@ -32,10 +23,19 @@ from gsmerge.io.cameras.camera_file import (
     Convention,
     check_size,
 )
-from gsmerge.io.formats.read import clear_invalid, clear_rows, find_empty
+from gsmerge.io.formats.read_gaussians import clear_invalid, clear_rows, find_empty
 from gsmerge.io.photo_files import photo_array
+from gsmerge.reading.alignment import (
+    check_pairs,
+    choose_poses,
+    explain_misalignment,
+    misalignment_error,
+    move_cameras,
+    other_conventions,
+    sample_pixels,
+)
+from gsmerge.reading.input import TOLERANCE, check_numbers, check_poses, check_values
 from gsmerge.runtime.record import Progress
-from gsmerge.scene.input import TOLERANCE, check_numbers, check_poses, check_values
 from gsmerge.types import NO_CAMERAS, Cameras, Gaussians, Pixels, Scene
 
 if TYPE_CHECKING:

@@ -25,10 +25,10 @@ from gsmerge.facts.place_cameras import (
 )
 from gsmerge.facts.scene_size import SceneSize, measure_size, unlike_captures
 from gsmerge.geometry.frame import Frame, canonicalise, sample_rows
+from gsmerge.geometry.views import camera_kinds, subset
 from gsmerge.photos.compare import compare_photos
 from gsmerge.photos.exposure import equalise_exposure
 from gsmerge.photos.row_colors import NO_PHOTOS, PHOTOS, RENDERS, ROW_COLORS, add_row_colors
-from gsmerge.photos.views import camera_kinds, subset
 from gsmerge.runtime.record import note, record_choices, record_part, stage
 from gsmerge.settings.stages import Look, PrepareOptions
 from gsmerge.types import Cameras, PicturedScene, Scene

@@ -8,7 +8,7 @@ from functools import reduce
 import numpy as np
 
 from gsmerge.geometry.transforms import median, quantiles
-from gsmerge.photos.views import camera_kinds
+from gsmerge.geometry.views import camera_kinds
 from gsmerge.types import Gaussians, Scene
 
 # Limits that the Gaussians of every real capture keep. The median of the Gaussians' largest scales is at most

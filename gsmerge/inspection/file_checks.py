@@ -9,17 +9,17 @@ from pathlib import Path
 from gsmerge.errors import SceneError
 from gsmerge.io import file_notes
 from gsmerge.io.bounds import check_file
-from gsmerge.io.cameras.read import read_cameras
+from gsmerge.io.cameras.read_cameras import read_cameras
 from gsmerge.io.cameras.table import CAMERA_ENDINGS
 from gsmerge.io.formats import ply, streamed
-from gsmerge.io.formats.read import degree_notes
+from gsmerge.io.formats.read_gaussians import degree_notes
 from gsmerge.io.formats.table import READ_ENDINGS, SCENE_SUFFIXES, STATE, STATE_ENDING, may_hold_gaussians
 from gsmerge.io.image_names import IMAGE_SUFFIXES, OTHER_SUFFIXES
-from gsmerge.io.scene_files import find_scene_files
 from gsmerge.networks.checkpoint import load_checkpoint
+from gsmerge.reading.exporters import NO_HINTS
+from gsmerge.reading.read_scene import load_files
+from gsmerge.reading.scene_files import find_scene_files
 from gsmerge.runtime.memory import human_bytes
-from gsmerge.scene.exporters import NO_HINTS
-from gsmerge.scene.read import load_files
 from gsmerge.settings.reading import OpacityChoice, ReadHints
 from gsmerge.states.state_file import holds_features, load_state
 

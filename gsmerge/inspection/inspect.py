@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from gsmerge.cameras import check_cameras
 from gsmerge.compaction.estimate import estimate, estimate_lines
 from gsmerge.errors import Doubt, SceneError
 from gsmerge.facts.confirm_depths import Agreement, confirm_depths
@@ -20,24 +19,25 @@ from gsmerge.facts.scene_size import unlike_captures
 from gsmerge.facts.support import count_views_in_world
 from gsmerge.geometry.frame import canonicalise
 from gsmerge.io import GaussianFile, file_notes, kept_comments
-from gsmerge.io.formats.arrays import read_expected_scores
 from gsmerge.io.formats.gsm import list_batches
 from gsmerge.io.formats.ply import is_from_gsmerge
-from gsmerge.io.formats.read import degree_notes
+from gsmerge.io.formats.read_gaussians import degree_notes
+from gsmerge.io.formats.rows import read_expected_scores
 from gsmerge.io.photo_files import photo_array
-from gsmerge.io.scene_files import SceneFiles, find_scene_files
 from gsmerge.measure.coverage import coverage, extents
 from gsmerge.measure.documents import finite, note_entries, note_lines
 from gsmerge.photos.compare import compare_photos
 from gsmerge.plan import describe_share
 from gsmerge.raster.photos import LEAST_OPACITY
+from gsmerge.reading.alignment import check_cameras
+from gsmerge.reading.exporters import ReadHints, make_hints
+from gsmerge.reading.larger_photos import read_scene_cameras
+from gsmerge.reading.read_scene import Loaded, align_scene, read_gaussian_file
+from gsmerge.reading.scene_files import SceneFiles, find_scene_files
 from gsmerge.runtime.arguments import check_arguments
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.record import record_part, report_progress
 from gsmerge.runtime.threads import use_threads
-from gsmerge.scene.exporters import ReadHints, make_hints
-from gsmerge.scene.read import Loaded, align_scene, read_gaussian_file
-from gsmerge.scene.views import read_scene_cameras
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.settings.setting import join_words

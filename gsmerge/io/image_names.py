@@ -20,6 +20,11 @@ FILMS = frozenset(ending for ending, (content, _) in FOREIGN.items() if content 
 # Last bytes of the videos that gsmerge writes, which no other video has. Players skip these bytes as an unknown part
 CLIP_ENDS = {".mp4": b"\0\0\0\x0ffreegsmerge", ".webm": b"\xec\x87gsmerge"}
 _CUT_FILM = "save the frames that the model saw as photos, with ffmpeg -i FILM photos/%05d.jpg"
+IMAGE_PLACES = (  # places in a folder at which the photos of a scene may lie
+    "images_resized",  # photos as WorldMirror saw them; in its images/, tall photos are squeezed
+    "images", "input", "context", "rgb", "input_images", "color", "corrected_images", "keyframes/corrected_images",
+    "keyframes/images",
+)  # fmt: skip
 HOLD_PHOTOS = (".npz", ".gsm")  # endings of files that may have photos inside
 _NAME_FOLDER = "name the folder of the photos with {option}"
 _HIDDEN = ".@"  # first characters of hidden folders, such as .thumb and @eaDir

@@ -14,8 +14,7 @@ from gsmerge.io.bounds import check_file
 from gsmerge.io.first_bytes import FOREIGN
 from gsmerge.io.formats.ply import header_content
 from gsmerge.io.formats.table import SEVERAL_USES, may_hold_gaussians
-from gsmerge.io.image_names import IMAGE_SUFFIXES, OTHER_SUFFIXES, list_images
-from gsmerge.io.scene_files import IMAGE_PLACES
+from gsmerge.io.image_names import IMAGE_PLACES, IMAGE_SUFFIXES, OTHER_SUFFIXES, list_images
 
 MAX_SEARCHED_FOLDERS = 100  # most folders that are searched in a folder of scenes
 _NAME_PLY = "name the .ply of the Gaussians, or the folder that it is in"

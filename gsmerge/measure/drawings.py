@@ -10,12 +10,12 @@ from typing import Any
 
 from gsmerge.errors import SceneError, UsageError, name_notes
 from gsmerge.facts.place_cameras import add_views
+from gsmerge.geometry.views import pick_views, subset
 from gsmerge.io import file_notes, read_cameras, read_gaussians, to_cameras
 from gsmerge.io.atomic import atomic_outputs, common_mode
 from gsmerge.io.cameras.camera_file import sizes_of
-from gsmerge.io.cameras.read import read_sharp_camera
+from gsmerge.io.cameras.read_cameras import read_sharp_camera
 from gsmerge.io.image_names import IMAGE_SUFFIXES
-from gsmerge.io.scene_files import SceneFiles, find_scene_files
 from gsmerge.measure.camera_path import parse_camera_path, sample_path, viewing_depth
 from gsmerge.measure.clip import (
     FOLDER_HINT,
@@ -37,15 +37,15 @@ from gsmerge.measure.preview import (
     view_pictures,
 )
 from gsmerge.measure.sizes import fill_cameras, fill_photo, shrink_cameras
-from gsmerge.photos.views import pick_views, subset
 from gsmerge.raster import render_in_batches
 from gsmerge.raster.photos import NEAR_PLANE
+from gsmerge.reading.exporters import NO_HINTS, ReadHints
+from gsmerge.reading.held_out import read_into_frame
+from gsmerge.reading.read_scene import Loaded, move_cameras_to_scene, read_gaussian_file
+from gsmerge.reading.scene_files import SceneFiles, find_scene_files
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.record import Progress, record_run
 from gsmerge.runtime.threads import use_threads
-from gsmerge.scene.exporters import NO_HINTS, ReadHints
-from gsmerge.scene.held_out import read_into_frame
-from gsmerge.scene.read import Loaded, move_cameras_to_scene, read_gaussian_file
 from gsmerge.settings.pictures import CLIPS, GIF, PICTURES
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.types import Cameras, Gaussians, StrPath

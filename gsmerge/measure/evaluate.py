@@ -14,18 +14,18 @@ from gsmerge.arrays import ArrayFields, as_pictures
 from gsmerge.errors import Doubt, UsageError, list_doubts
 from gsmerge.facts.prepare import scored_pictures
 from gsmerge.geometry.frame import scene_frame
+from gsmerge.geometry.views import pick_views
 from gsmerge.measure.fog import ALL, Fog, describe_fog, measure_fog
 from gsmerge.measure.sizes import resize_mask, shrink_cameras, shrink_views
 from gsmerge.measure.visibility import context_points, visible_pixels
 from gsmerge.photos.row_colors import OWN_PHOTOS, PHOTOS, RENDERS, ROW_COLORS
-from gsmerge.photos.views import pick_views
 from gsmerge.raster import render
 from gsmerge.raster.metrics import describe_loss, psnr_within, ssim_within
 from gsmerge.raster.photos import COVERED_TRANSMITTANCE, NEAR_PLANE, WHOLE_SHARE
+from gsmerge.reading.input import check_scene
 from gsmerge.runtime.arguments import check_arguments
 from gsmerge.runtime.record import Progress
 from gsmerge.runtime.threads import use_threads
-from gsmerge.scene.input import check_scene
 from gsmerge.settings.evaluate import EvaluateOptions
 from gsmerge.types import Cameras, Gaussians, HasGaussians, Scene, Views, own_gaussians
 
@@ -203,7 +203,7 @@ def evaluate(
     Args:
         scene: The input. Without photos, results are compared with renders of the scene.
         results: Results of :func:`gsmerge.compact`, or Gaussians, by name, in the scene's world.
-        targets: Held-out views in the scene's world, see :func:`gsmerge.scene.held_out.read_held_out`.
+        targets: Held-out views in the scene's world, see :func:`gsmerge.reading.held_out.read_held_out`.
         options: Settings; None: the defaults, with LPIPS if its weights are installed.
         cameras: Cameras of the input views, by name of a result, for results that were made with other poses than the
             scene's. Such a result has these cameras as ``CompactResult.cameras``.

@@ -17,8 +17,8 @@ import numpy as np
 
 from gsmerge.fit.report import HAZE
 from gsmerge.geometry.transforms import camera_depths, middle_depth, step_outside
+from gsmerge.geometry.views import pick_views
 from gsmerge.measure.sizes import shrink_cameras
-from gsmerge.photos.views import pick_views
 from gsmerge.raster import Splats, make_splats, render, tile_view
 from gsmerge.raster.composite import blend_depths
 from gsmerge.runtime.record import Progress

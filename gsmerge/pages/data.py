@@ -11,6 +11,7 @@ import numpy as np
 from gsmerge.facts.confirm_depths import Agreement, confirm_depths
 from gsmerge.geometry.frame import Frame, scene_frame
 from gsmerge.geometry.transforms import middle_depth
+from gsmerge.geometry.views import even_views
 from gsmerge.io.encode_pictures import encode_picture
 from gsmerge.io.photo_files import photo_array
 from gsmerge.measure.camera_path import outside_camera
@@ -18,7 +19,6 @@ from gsmerge.measure.evaluate import INPUT, EvaluateOptions, Evaluation, Quality
 from gsmerge.measure.lpips import lpips_available
 from gsmerge.measure.preview import OUTSIDE_VIEW, BytePicture, to_picture
 from gsmerge.pages.splats import MAX_GAUSSIANS, highest_degree, pack_splats
-from gsmerge.photos.views import even_views
 from gsmerge.raster import render
 from gsmerge.raster.metrics import is_worse
 from gsmerge.raster.photos import NEAR_PLANE, WHOLE_SHARE

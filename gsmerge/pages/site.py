@@ -8,15 +8,15 @@ from pathlib import Path
 
 from gsmerge.facts.place_cameras import place_viewpoints
 from gsmerge.geometry.transforms import middle_depth
+from gsmerge.geometry.views import even_views
 from gsmerge.io.atomic import AddOutput
-from gsmerge.io.formats.arrays import read_expected_scores
+from gsmerge.io.formats.rows import read_expected_scores
 from gsmerge.io.formats.sog import sog_bytes
 from gsmerge.io.formats.table import Contents
 from gsmerge.measure.camera_path import median_camera
 from gsmerge.measure.preview import to_picture
 from gsmerge.pages.data import encode_still
 from gsmerge.pages.page import VIEWER, base64_text, data_uri, describe_gain, page_camera, render_template
-from gsmerge.photos.views import even_views
 from gsmerge.raster import render
 from gsmerge.types import Cameras, Gaussians
 

@@ -16,8 +16,8 @@ import cv2
 import numpy as np
 
 from gsmerge.geometry.transforms import camera_depths, sh0_to_rgb
+from gsmerge.geometry.views import camera_kinds, subset
 from gsmerge.kernels.pictures import blur
-from gsmerge.photos.views import camera_kinds, subset
 from gsmerge.raster import make_splats, tile_view
 from gsmerge.raster.composite import blend, view_colors
 from gsmerge.raster.photos import COVERED_TRANSMITTANCE, WHOLE_SHARE, blank_photos

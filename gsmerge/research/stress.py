@@ -20,8 +20,8 @@ from gsmerge.compaction.compact import compact
 from gsmerge.errors import GsmergeError, UsageError
 from gsmerge.geometry.frame import Frame, scene_frame
 from gsmerge.geometry.transforms import move_views
+from gsmerge.geometry.views import even_views, subset, take_rows
 from gsmerge.measure.evaluate import EvaluateOptions, evaluate
-from gsmerge.photos.views import even_views, subset, take_rows
 from gsmerge.runtime.record import Progress
 from gsmerge.settings.budget import BudgetOptions
 from gsmerge.settings.compact import CompactOptions

@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from gsmerge.fit import peak_weights
-from gsmerge.photos.views import pick_views
+from gsmerge.geometry.views import pick_views
 from gsmerge.raster import make_splats
 from gsmerge.raster.photos import Photos, blank_photos, photo_errors
 from gsmerge.runtime.record import stage

@@ -10,9 +10,9 @@ from gsmerge.compaction.compact import compact
 from gsmerge.compaction.result import CompactResult
 from gsmerge.errors import UsageError
 from gsmerge.io.formats.table import STATE_ENDING
+from gsmerge.reading.input import as_scene
 from gsmerge.runtime.arguments import check_arguments
 from gsmerge.runtime.record import Progress
-from gsmerge.scene.input import as_scene
 from gsmerge.settings.extend import batch_settings
 from gsmerge.settings.stages import DecodeOptions
 from gsmerge.states.extend import BatchReport, extend

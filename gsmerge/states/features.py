@@ -17,6 +17,7 @@ from gsmerge.errors import UsageError
 from gsmerge.facts.prepare import Prepared, prepare
 from gsmerge.geometry.frame import Frame
 from gsmerge.geometry.pooling import Members, feature_to_gaussians, gaussian_members
+from gsmerge.geometry.views import concat_cameras, resize_cameras
 from gsmerge.io.formats.gsm import NUM_HIGHER
 from gsmerge.kernels.gaussians.cluster import connected_components
 from gsmerge.networks.apply import NetworkContext, decode_gaussians
@@ -24,7 +25,6 @@ from gsmerge.networks.checkpoint import Checkpoint
 from gsmerge.networks.cross_view_stats import cross_view_stats
 from gsmerge.networks.tokens import GroupFeatures, describe_features, make_group_features
 from gsmerge.networks.weights import NetworkWeights
-from gsmerge.photos.views import concat_cameras, resize_cameras
 from gsmerge.pipeline import encode_groups
 from gsmerge.plan import make_plan
 from gsmerge.runtime.record import Progress, record_run, stage

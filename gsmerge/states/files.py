@@ -14,16 +14,16 @@ from gsmerge.compaction.files import read_input
 from gsmerge.compaction.outputs import Outputs, write_outputs
 from gsmerge.errors import SceneError, UsageError, count_words
 from gsmerge.io.atomic import common_mode
-from gsmerge.io.formats.arrays import result_comments
 from gsmerge.io.formats.rounding import format_notes
+from gsmerge.io.formats.rows import result_comments
 from gsmerge.io.formats.table import Contents
 from gsmerge.io.locks import lock_file
-from gsmerge.io.scene_files import SceneFiles, scene_title
 from gsmerge.measure.documents import document_head, note_entries, seconds_document, seconds_line
+from gsmerge.reading.content_hash import content_hash, digest, doubt_changed, list_files
+from gsmerge.reading.exporters import NO_HINTS, ReadHints
+from gsmerge.reading.scene_files import SceneFiles, scene_title
 from gsmerge.runtime.memory import human_bytes, human_share, peak_memory
 from gsmerge.runtime.record import Progress
-from gsmerge.scene.content_hash import content_hash, digest, doubt_changed, list_files
-from gsmerge.scene.exporters import NO_HINTS, ReadHints
 from gsmerge.settings.extend import batch_settings
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.settings.stages import DecodeOptions

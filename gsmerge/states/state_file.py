@@ -27,7 +27,7 @@ from gsmerge.io.formats.gsm import (
 from gsmerge.networks.checkpoint import build_networks
 from gsmerge.networks.options import CORRECTED, GROUP_COLUMNS
 from gsmerge.networks.weights import NetworkWeights
-from gsmerge.scene.read import load_scene
+from gsmerge.reading.read_scene import load_scene
 from gsmerge.states.features import FeatureState, ViewSamples
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Scene, StrPath
 

@@ -86,7 +86,7 @@ def test_functions_in_the_table_of_arrows_are_in_the_files_beside_them() -> None
 
 def test_table_of_cameras_has_each_file_of_that_folder() -> None:
     cells = "".join(line.split("|")[1] for line in section("Cameras").splitlines() if line.startswith("| `"))
-    files = [path for path in (PACKAGE / "cameras").iterdir() if not path.name.startswith("_")]
+    files = [path for path in (PACKAGE / "reading/alignment").iterdir() if not path.name.startswith("_")]
     names = {path.stem if path.is_file() else f"{path.name}/" for path in files}
     assert set(re.findall(r"`([\w/]+)`", cells)) == names
 

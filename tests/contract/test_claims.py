@@ -16,14 +16,12 @@ from scripts import load_script
 
 import gsmerge
 from gsmerge import plan, types
-from gsmerge.cameras import rows_first, score
-from gsmerge.cameras import score as cameras_off
-from gsmerge.cameras.registration import register
 from gsmerge.compaction import blocks, curve, distance, new_views, partition, scores, seams, search
 from gsmerge.facts import confirm_depths, draw_outside, holes, move_poses, scene_size
 from gsmerge.facts.prepare import LEAST_VIEWS
 from gsmerge.fit import outside, photo_sizes, schedule, stage
 from gsmerge.fit import report as fit_report
+from gsmerge.geometry import views
 from gsmerge.io import bounds, photo_files
 from gsmerge.io.formats import ply
 from gsmerge.kernels.raster import blend
@@ -31,11 +29,16 @@ from gsmerge.measure import drawings, fog
 from gsmerge.networks.checkpoint import IN_PACKAGE, load_checkpoint
 from gsmerge.networks.options import RESIDUAL, SLOTS
 from gsmerge.pages import data, splats
-from gsmerge.photos import colors, compare, exposure, views
+from gsmerge.photos import compare, exposure
 from gsmerge.raster import metrics, photos, tiled_view
+from gsmerge.reading.alignment import align_rows as rows_first
+from gsmerge.reading.alignment import score
+from gsmerge.reading.alignment import score as cameras_off
+from gsmerge.reading.alignment.registration import register
+from gsmerge.reading.held_out import read_held_out
+from gsmerge.reading.photos import colors
+from gsmerge.reading.read_scene import load_scene
 from gsmerge.runtime import memory, work
-from gsmerge.scene.held_out import read_held_out
-from gsmerge.scene.read import load_scene
 from gsmerge.settings.budget import DEVICES
 from gsmerge.settings.compact import RECIPES, method_names
 from gsmerge.settings.extend import ExtendOptions

@@ -60,7 +60,7 @@ def test_no_function_takes_the_record_of_a_run() -> None:
 def test_no_code_beyond_io_asks_for_the_kind_of_a_scene() -> None:
     call = re.compile(r"\bisinstance\([^()]*(\([^()]*\)[^()]*)*,[^()]*\(?[^()]*\bScene\b")
     for path, text in texts().items():
-        assert {PACKAGE / "io", PACKAGE / "scene"} & {*path.parents} or not call.search(text), path
+        assert {PACKAGE / "io", PACKAGE / "reading"} & {*path.parents} or not call.search(text), path
 
 
 def test_prepared_facts_are_few() -> None:

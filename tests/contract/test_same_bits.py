@@ -31,7 +31,7 @@ REFUSED = {
 OTHERS = ("pages/", "research/", "measure/clip.py", "measure/lpips.py", "measure/preview.py", "networks/tensors.py")
 ALLOWED = {
     ("io/cameras/camera_file.py", "cv2.remap"),  # of bytes: whole numbers
-    ("cameras/registration/keypoints.py", "@"),  # of whole numbers below 2^24, which float32 has exactly
+    ("reading/alignment/registration/keypoints.py", "@"),  # of whole numbers below 2^24, which float32 has exactly
 }
 
 

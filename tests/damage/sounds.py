@@ -39,13 +39,13 @@ from gsmerge.cli.parameters import read_settings
 from gsmerge.errors import GsmergeError, SceneError, UsageError
 from gsmerge.io import atomic_outputs, read_cameras, read_gaussians, read_images
 from gsmerge.io.cameras.dataparser import read_dataparser
-from gsmerge.io.cameras.read import read_sharp_camera
+from gsmerge.io.cameras.read_cameras import read_sharp_camera
 from gsmerge.io.formats import tileset
 from gsmerge.io.formats.table import Contents
 from gsmerge.io.photo_files import decode_alpha, decode_levels
 from gsmerge.kernels.matrices import invert
 from gsmerge.networks.checkpoint import load_checkpoint
-from gsmerge.scene.read import load_scene
+from gsmerge.reading.read_scene import load_scene
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.states.compactor import Compactor
 from gsmerge.states.state_file import load_state

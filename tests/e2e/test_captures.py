@@ -14,7 +14,7 @@ from scripts import load_script
 from shared import make_once, write_scene
 
 import gsmerge
-from gsmerge.scene.read import load_scene
+from gsmerge.reading.read_scene import load_scene
 
 ROOT = Path(__file__).parents[2]
 

@@ -78,7 +78,7 @@ def test_folder_without_permission_is_refused(smallest_copy: Path, run: Run) -> 
 @pytest.mark.parametrize(
     ("file", "reader"),
     [
-        ("scene.ply", "gsmerge.io.formats.arrays.FileRows.__getitem__"),
+        ("scene.ply", "gsmerge.io.formats.rows.FileRows.__getitem__"),
         ("scene.sog", "gsmerge.io.formats.sog._read_packed"),
         ("scene.spz", "gsmerge.io.formats.spz._unpack"),
         ("views.npz", "numpy.lib.format.read_array"),

@@ -10,7 +10,7 @@ import pytest
 from shared import write_smallest
 
 import gsmerge
-from gsmerge.photos.views import subset
+from gsmerge.geometry.views import subset
 
 from .conftest import Run
 

@@ -20,9 +20,9 @@ from shared import make_once, write_scene
 
 import gsmerge
 from gsmerge.cli import main
-from gsmerge.io.cameras.read import read_cameras
-from gsmerge.io.scene_files import find_scene_files
-from gsmerge.scene.read import load_scene
+from gsmerge.io.cameras.read_cameras import read_cameras
+from gsmerge.reading.read_scene import load_scene
+from gsmerge.reading.scene_files import find_scene_files
 from gsmerge.states.extend import NOT_COMPARED
 from gsmerge.states.state_file import load_state, save_state
 

@@ -16,7 +16,7 @@ from sweeps import sweep
 
 import gsmerge
 from gsmerge import Scene
-from gsmerge.photos.views import subset
+from gsmerge.geometry.views import subset
 from gsmerge.raster.metrics import MAX_LOSS
 
 from .conftest import Run

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gsmerge.io.formats import arrays
+from gsmerge.io.formats import rows as arrays
 from gsmerge.io.formats.compressed import CHUNK, COLOR_RANGES, RANGE_COLUMNS, SH_RANGE
 from gsmerge.io.formats.spz import HEADER, MAGIC, MIP_FLAG, spz_columns
 from gsmerge.types import Gaussians

@@ -22,9 +22,9 @@ from gsmerge.compaction.result import CompactResult
 from gsmerge.fit import FitJob, FitOptions
 from gsmerge.fit.schedule import FitRun, prepare_fit
 from gsmerge.geometry.transforms import covariances, normalize, quat_to_rotmat, rotmat_to_quat
+from gsmerge.geometry.views import subset, take_rows
 from gsmerge.kernels import elementary
 from gsmerge.kernels.matrices import invert, matmul
-from gsmerge.photos.views import subset, take_rows
 from gsmerge.raster.photos import Photos, scene_photos
 from gsmerge.research.generate import objects, photograph, shapes
 from gsmerge.research.generate.noise import Noise, TrueView, pixel_gaussians

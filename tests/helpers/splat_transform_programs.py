@@ -18,7 +18,7 @@ import pytest
 from gsmerge import Gaussians
 from gsmerge.errors import UsageError
 from gsmerge.io.formats import sog, splat_transform
-from gsmerge.io.formats.arrays import Columns, to_columns
+from gsmerge.io.formats.rows import Columns, to_columns
 from gsmerge.io.formats.splat_transform import VARIABLE, find_program
 
 NO_PROGRAM = "no splat-transform on the PATH, which .ci/splat-transform installs"

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsmerge.io.formats import arrays
-from gsmerge.io.formats.read import _convert_with_kernel, _convert_with_numpy
+from gsmerge.io.formats import rows as arrays
+from gsmerge.io.formats.read_gaussians import _convert_with_kernel, _convert_with_numpy
 
 N = 200
 ODD = {

@@ -9,7 +9,7 @@ from types import ModuleType
 import pytest
 from scripts import load_script
 
-from gsmerge.scene.read import load_scene
+from gsmerge.reading.read_scene import load_scene
 
 pytestmark = pytest.mark.slow
 

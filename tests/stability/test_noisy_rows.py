@@ -14,8 +14,8 @@ from shared import write_scene
 from sweeps import sweep
 
 from gsmerge.facts.prepare import prepare
+from gsmerge.reading.read_scene import load_scene
 from gsmerge.runtime.record import record_run
-from gsmerge.scene.read import load_scene
 
 VIEWS = 6
 SEEDS = (20, 4, 9, 0, 1, 2, 3, 5, 6, 7, 8, 10)

@@ -10,8 +10,8 @@ import scenes
 from sweeps import sweep
 
 from gsmerge import Cameras, Scene
+from gsmerge.geometry.views import concat_cameras
 from gsmerge.kernels import elementary
-from gsmerge.photos.views import concat_cameras
 
 
 @pytest.fixture(scope="module")

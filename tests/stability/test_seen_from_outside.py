@@ -11,8 +11,8 @@ import scenes
 from sweeps import sweep
 
 from gsmerge import Gaussians, Scene
+from gsmerge.geometry.views import concat_cameras
 from gsmerge.measure.fog import HAZE, measure_fog
-from gsmerge.photos.views import concat_cameras
 from gsmerge.types import Pixels
 
 SIZE = (112, 84)

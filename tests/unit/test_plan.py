@@ -23,8 +23,8 @@ from gsmerge.facts.prepare import prepare
 from gsmerge.facts.scene_size import SceneSize, measure_size
 from gsmerge.fit import Fitted
 from gsmerge.geometry.frame import canonicalise
+from gsmerge.geometry.views import REPORT_VIEWS
 from gsmerge.networks.checkpoint import IN_PACKAGE
-from gsmerge.photos.views import REPORT_VIEWS
 from gsmerge.plan import (
     EFFORTS,
     FIDELITY_LOSS,

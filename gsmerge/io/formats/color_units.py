@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsmerge.io.formats import arrays, ply
+from gsmerge.io.formats import ply
+from gsmerge.io.formats import rows as arrays
 from gsmerge.io.formats.scale_units import MIN_JUDGED, SAMPLES
 from gsmerge.settings.reading import ColorChoice
 

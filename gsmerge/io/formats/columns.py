@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from gsmerge.errors import Note, SceneError
-from gsmerge.io.formats import arrays
+from gsmerge.io.formats import rows as arrays
 
 _MOMENT = "save one moment as a .ply, with positions, rotations and opacities of that time"
 

@@ -18,8 +18,8 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.geometry.transforms import rgb_to_sh0
-from gsmerge.io.formats import arrays
-from gsmerge.io.formats.arrays import PACKED
+from gsmerge.io.formats import rows as arrays
+from gsmerge.io.formats.rows import PACKED
 from gsmerge.kernels.elementary import log, log1p
 
 if TYPE_CHECKING:

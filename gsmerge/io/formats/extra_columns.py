@@ -10,7 +10,7 @@ import numpy as np
 from gsmerge.errors import SceneError
 from gsmerge.io.formats import ply
 from gsmerge.io.formats.columns import describes_places, list_names
-from gsmerge.io.formats.read import FileInfo
+from gsmerge.io.formats.read_gaussians import FileInfo
 from gsmerge.io.formats.table import PLY, Format
 
 

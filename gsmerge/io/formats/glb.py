@@ -23,7 +23,7 @@ from gsmerge.errors import SceneError
 from gsmerge.geometry.transforms import quat_to_rotmat
 from gsmerge.io.bounds import ReadBudget, check_whole, parse_json, read_budget, read_errors
 from gsmerge.io.cameras.viewer_cameras import order_views, vertical_field
-from gsmerge.io.formats.arrays import (
+from gsmerge.io.formats.rows import (
     Columns,
     Packed,
     StoredRows,

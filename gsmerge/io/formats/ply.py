@@ -22,9 +22,9 @@ from plyfile import PlyData, PlyElementParseError, PlyParseError
 
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.io.bounds import ReadBudget, read_budget, read_errors
-from gsmerge.io.formats import arrays
-from gsmerge.io.formats.arrays import FileRows, truncated
+from gsmerge.io.formats import rows as arrays
 from gsmerge.io.formats.columns import check_columns
+from gsmerge.io.formats.rows import FileRows, truncated
 from gsmerge.io.image_names import IMAGE_SUFFIXES, OTHER_SUFFIXES
 from gsmerge.kernels.elementary import log, log1p
 from gsmerge.runtime.plugins import LazyFunction
@@ -32,7 +32,7 @@ from gsmerge.runtime.threads import quiet_warnings
 from gsmerge.types import Gaussians
 
 _compressed_rows = LazyFunction("gsmerge.io.formats.compressed", "packed_rows")
-_holds_cameras = LazyFunction("gsmerge.io.cameras.read", "holds_cameras")
+_holds_cameras = LazyFunction("gsmerge.io.cameras.read_cameras", "holds_cameras")
 MAX_DEGREE = 3  # of the harmonics in results; splat-transform 3.7 and gsply refuse a .ply with more
 # Bytes of the longest comment on the expected scores of new views
 COMMENT_BYTES = len(f"comment {arrays.new_views_comment(arrays.ExpectedScores(-100, -100, -100, -100))}\n")

@@ -10,7 +10,7 @@ import numpy as np
 
 from gsmerge.arrays import distinct
 from gsmerge.geometry.transforms import medians
-from gsmerge.io.formats.read import read_gaussians
+from gsmerge.io.formats.read_gaussians import read_gaussians
 from gsmerge.io.formats.table import PLY, output_format
 from gsmerge.io.formats.write import limit_notes, write_gaussians
 from gsmerge.types import Gaussians, StrPath

@@ -10,7 +10,7 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.geometry.transforms import median, quantiles
-from gsmerge.io.formats import arrays
+from gsmerge.io.formats import rows as arrays
 from gsmerge.kernels.elementary import log
 from gsmerge.runtime.memory import gather
 from gsmerge.settings.reading import ScaleChoice

@@ -37,7 +37,7 @@ from gsmerge.io.bounds import (
     read_json,
     read_text,
 )
-from gsmerge.io.formats import arrays
+from gsmerge.io.formats import rows as arrays
 from gsmerge.io.formats.table import META
 from gsmerge.kernels.elementary import expm1, log1p
 from gsmerge.types import Gaussians
@@ -272,7 +272,7 @@ def _read_palette(files: _Files, meta: dict[str, Any], count: int, budget: ReadB
 def sog_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> bytes:
     """Encode a ``.sog``, with rows in the order of a space-filling curve; raise ValueError if there is NaN or inf.
 
-    ``comments`` may state the mode of rendering, see :func:`gsmerge.io.formats.arrays.render_mode`.
+    ``comments`` may state the mode of rendering, see :func:`gsmerge.io.formats.rows.render_mode`.
     """
     columns = arrays.to_columns(gaussians, MAX_DEGREE).along_curve()
     content = io.BytesIO()

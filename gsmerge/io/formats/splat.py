@@ -14,7 +14,7 @@ import numpy as np
 from gsmerge.errors import SceneError
 from gsmerge.geometry.transforms import rgb_to_sh0
 from gsmerge.io.bounds import check_file, read_errors
-from gsmerge.io.formats.arrays import EXPORT_AGAIN, Columns, Packed, StoredRows, column_blocks, to_bytes, to_stored
+from gsmerge.io.formats.rows import EXPORT_AGAIN, Columns, Packed, StoredRows, column_blocks, to_bytes, to_stored
 from gsmerge.kernels.elementary import exp, log
 from gsmerge.types import Gaussians
 

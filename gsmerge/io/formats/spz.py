@@ -29,7 +29,7 @@ from gsmerge.arrays import as_array, to_float32
 from gsmerge.errors import SceneError
 from gsmerge.geometry.transforms import rgb_to_sh0
 from gsmerge.io.bounds import ReadBudget, check_file, read_errors
-from gsmerge.io.formats import arrays
+from gsmerge.io.formats import rows as arrays
 from gsmerge.io.formats.table import Contents
 from gsmerge.types import SH_C0, Gaussians, StrPath
 
@@ -363,7 +363,7 @@ def _pack_rotations(quats: np.ndarray, version: int) -> np.ndarray:
 def spz_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> bytes:
     """Encode a ``.spz`` file of version 3; raise ValueError if there is NaN or inf.
 
-    ``comments`` may state the mode of rendering, see :func:`gsmerge.io.formats.arrays.render_mode`.
+    ``comments`` may state the mode of rendering, see :func:`gsmerge.io.formats.rows.render_mode`.
     """
     return encode_contents(gaussians, Contents([gaussians], comments))
 

@@ -24,8 +24,9 @@ import numpy as np
 from gsmerge.errors import SceneError, UsageError, count_words
 from gsmerge.io.atomic import AddOutput, atomic_outputs
 from gsmerge.io.bounds import ReadBudget, check_file, check_whole, read_json
-from gsmerge.io.formats import arrays, sog
-from gsmerge.io.formats.read import GaussianFile, convert_stored
+from gsmerge.io.formats import rows as arrays
+from gsmerge.io.formats import sog
+from gsmerge.io.formats.read_gaussians import GaussianFile, convert_stored
 from gsmerge.io.formats.splat_transform import blame_program, run_program
 from gsmerge.io.formats.table import INDEX, Contents
 from gsmerge.io.formats.write import write_ply

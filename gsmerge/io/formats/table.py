@@ -15,7 +15,7 @@ from gsmerge.arrays import to_float32
 from gsmerge.errors import UsageError
 from gsmerge.io.atomic import AddOutput
 from gsmerge.io.formats import ply
-from gsmerge.io.formats.arrays import FLAT_COMMENT, MIP_COMMENT, StoredRows
+from gsmerge.io.formats.rows import FLAT_COMMENT, MIP_COMMENT, StoredRows
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.plugins import lazy_functions
 from gsmerge.settings.files import FileOptions

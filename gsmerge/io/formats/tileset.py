@@ -19,8 +19,8 @@ from gsmerge.errors import SceneError
 from gsmerge.io.atomic import AddOutput
 from gsmerge.io.bounds import read_json
 from gsmerge.io.formats import glb
-from gsmerge.io.formats.arrays import StoredRows
 from gsmerge.io.formats.glb import COLOR_SPACE, COMPRESSED, HALF_TURN, HARMONICS, NAME, pack_glb
+from gsmerge.io.formats.rows import StoredRows
 from gsmerge.io.formats.spz import MAX_DEGREE, encode_contents
 from gsmerge.io.formats.table import TILESET, Contents
 from gsmerge.kernels.elementary import cos, sin

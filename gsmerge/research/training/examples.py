@@ -18,6 +18,8 @@ from gsmerge.errors import SceneError
 from gsmerge.geometry.pooling import Members, feature_to_gaussians
 from gsmerge.geometry.transforms import lower_median
 from gsmerge.raster.photos import Photos, blank_photos, scene_pictures
+from gsmerge.reading.held_out import read_held_out
+from gsmerge.reading.read_scene import load_scene
 from gsmerge.research.training.scenes import (
     TrainingScene,
     covered_pixels,
@@ -26,8 +28,6 @@ from gsmerge.research.training.scenes import (
     view_subsets,
 )
 from gsmerge.research.training.train_options import TrainOptions
-from gsmerge.scene.held_out import read_held_out
-from gsmerge.scene.read import load_scene
 from gsmerge.settings.budget import share_text
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.stages.encode import encode

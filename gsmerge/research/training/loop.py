@@ -24,10 +24,10 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from gsmerge.errors import SceneError
+from gsmerge.geometry.views import even_views
 from gsmerge.io.atomic import atomic_output
 from gsmerge.networks.checkpoint import save_checkpoint
 from gsmerge.networks.corrections import LOGIT_COLUMN
-from gsmerge.photos.views import even_views
 from gsmerge.research.training.examples import Example, draw_random_views, recolor
 from gsmerge.research.training.losses import render_window, window_loss, window_psnr
 from gsmerge.research.training.modules import Head, Networks

@@ -9,9 +9,9 @@ import numpy as np
 
 from gsmerge.geometry.frame import canonicalise
 from gsmerge.geometry.pooling import Members, scene_members
+from gsmerge.geometry.views import concat_cameras, even_views, resize_cameras, subset
 from gsmerge.measure.sizes import resize_photo
 from gsmerge.measure.visibility import context_points, visible_pixels
-from gsmerge.photos.views import concat_cameras, even_views, resize_cameras, subset
 from gsmerge.raster import composite, make_splats, tile_view
 from gsmerge.raster.photos import NEAR_PLANE, Photos, photos_of
 from gsmerge.runtime.threads import parallel_map

@@ -21,12 +21,12 @@ from safetensors.numpy import save
 from gsmerge.errors import SceneError
 from gsmerge.geometry.pooling import Members
 from gsmerge.io.atomic import atomic_output
-from gsmerge.io.scene_files import find_scene_files
 from gsmerge.raster.photos import Photos
+from gsmerge.reading.content_hash import content_hash, digest, list_files
+from gsmerge.reading.scene_files import find_scene_files
 from gsmerge.research.training.examples import Example, example_name, make_examples
 from gsmerge.research.training.train_options import TrainOptions
 from gsmerge.runtime.record import Progress
-from gsmerge.scene.content_hash import content_hash, digest, list_files
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians
 from gsmerge.version import __version__
 

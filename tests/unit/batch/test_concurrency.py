@@ -12,10 +12,10 @@ from batches import InlinePool
 from gsmerge.batch import BatchOptions, Job, run
 from gsmerge.batch.jobs import CompactCall
 from gsmerge.batch.run import choose_concurrency
+from gsmerge.reading.exporters import NO_HINTS
 from gsmerge.runtime.memory import memory_bytes
 from gsmerge.runtime.processes import ProcessPool
 from gsmerge.runtime.work import Call
-from gsmerge.scene.exporters import NO_HINTS
 from gsmerge.settings.compact import CompactOptions
 
 CALL = CompactCall(CompactOptions(), "auto", NO_HINTS)

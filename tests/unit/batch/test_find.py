@@ -15,7 +15,7 @@ from messages import refuses
 
 from gsmerge.batch.find import describe_lost, find_named_scenes, find_scenes
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.io.scene_files import find_scene_files
+from gsmerge.reading.scene_files import find_scene_files
 
 OUT = Path("out")
 pytestmark = pytest.mark.usefixtures("inside")

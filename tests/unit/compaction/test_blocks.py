@@ -18,8 +18,8 @@ from gsmerge.facts.scene_size import measure_size
 from gsmerge.fit import FitJob, FitOptions, fit_gaussians
 from gsmerge.fit.photo_sizes import fit_photos
 from gsmerge.geometry.frame import canonicalise
+from gsmerge.geometry.views import subset
 from gsmerge.photos.row_colors import ROW_COLORS
-from gsmerge.photos.views import subset
 from gsmerge.plan import choose_blocks
 from gsmerge.runtime import memory
 from gsmerge.settings.budget import DEVICES

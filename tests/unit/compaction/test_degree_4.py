@@ -16,7 +16,7 @@ from gsmerge.compaction.outputs import Outputs
 from gsmerge.inspection.file_checks import check_content
 from gsmerge.io import read_gaussians, write_ply
 from gsmerge.io.formats.ply import file_bytes
-from gsmerge.io.scene_files import find_scene_files
+from gsmerge.reading.scene_files import find_scene_files
 from gsmerge.settings.compact import CompactOptions
 
 PLAIN = CompactOptions().with_settings({"superpixels": "20%", "fit": "none", "threads": 1})

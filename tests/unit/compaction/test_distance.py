@@ -25,7 +25,7 @@ from gsmerge.compaction.distance import (
 from gsmerge.errors import TargetError
 from gsmerge.facts.place_cameras import between_cameras
 from gsmerge.facts.prepare import Prepared, prepare
-from gsmerge.photos.views import resize_cameras
+from gsmerge.geometry.views import resize_cameras
 from gsmerge.raster.metrics import decibels
 
 

@@ -11,7 +11,7 @@ from plyfile import PlyData, PlyElement
 from tiny_scene import make_tiny
 
 from gsmerge.compaction.files import read_input
-from gsmerge.io.scene_files import find_scene_files
+from gsmerge.reading.scene_files import find_scene_files
 
 
 @pytest.mark.parametrize(

@@ -13,9 +13,9 @@ from gsmerge.compaction.left_out import choose_left_out, leave_out, mark_seen, m
 from gsmerge.compaction.new_views import OWN_WEIGHT, SPREAD, Trial, shrink_scene
 from gsmerge.compaction.report import NewViews
 from gsmerge.facts.prepare import LEAST_VIEWS, prepare
-from gsmerge.io.formats.arrays import ExpectedScores, copied_comments, new_views_comment, read_expected_scores
+from gsmerge.geometry.views import subset
+from gsmerge.io.formats.rows import ExpectedScores, copied_comments, new_views_comment, read_expected_scores
 from gsmerge.pages.page import describe_gain
-from gsmerge.photos.views import subset
 from gsmerge.settings.stages import PrepareOptions
 from gsmerge.types import PicturedScene
 

@@ -16,7 +16,7 @@ from scenes import FIELDS, arc, make_scene, move, room
 from gsmerge import CompactResult, Gaussians, Scene, SceneError, compact, compact_tensors, evaluate, read_scene, render
 from gsmerge.geometry.transforms import sh0_to_rgb
 from gsmerge.kernels import elementary
-from gsmerge.scene.input import check_scene
+from gsmerge.reading.input import check_scene
 
 FAST: dict[str, Any] = {"effort": "draft", "superpixels": "10%", "fit": "none"}
 SHAPE = (3, 36, 48)

@@ -16,7 +16,7 @@ from gsmerge.facts.draw_outside import draw_outside
 from gsmerge.facts.pixels import with_pixels
 from gsmerge.facts.prepare import prepare
 from gsmerge.geometry.frame import canonicalise
-from gsmerge.photos.views import subset
+from gsmerge.geometry.views import subset
 from gsmerge.types import SH_C0, LargePhotos, PicturedScene
 
 VIEWS = 3

@@ -18,8 +18,8 @@ from gsmerge.facts.prepare import prepare
 from gsmerge.geometry.transforms import camera_depths, rgb_to_sh0
 from gsmerge.kernels import elementary
 from gsmerge.raster import render
+from gsmerge.reading.read_scene import load_scene
 from gsmerge.runtime.record import record_run
-from gsmerge.scene.read import load_scene
 from gsmerge.types import Cameras, Gaussians, PicturedScene, Pixels
 
 WIDTH, HEIGHT, NEAR, FAR, FLOOR = 96, 64, 3.0, 6.0, 24

@@ -14,8 +14,8 @@ from gsmerge.fit import FitOptions, fit_photos
 from gsmerge.geometry.frame import canonicalise, scene_frame
 from gsmerge.geometry.transforms import project
 from gsmerge.photos.row_colors import PHOTOS, ROW_COLORS
-from gsmerge.photos.scene_photos import without_photo
 from gsmerge.raster.photos import MASKED_WEIGHT, scene_pictures
+from gsmerge.reading.photos.scene_photos import without_photo
 from gsmerge.runtime.record import record_part
 
 

@@ -17,7 +17,7 @@ from gsmerge.fit.full import fit_full
 from gsmerge.fit.photo_sizes import large_photos, largest_scale, photo_scale, training_weights
 from gsmerge.fit.schedule import DrawMode, prepare_fit
 from gsmerge.geometry.transforms import project
-from gsmerge.photos.views import subset
+from gsmerge.geometry.views import subset
 from gsmerge.raster.photos import MASKED_WEIGHT, scene_photos, score_photos
 from gsmerge.raster.tiled_view import EPS2D
 from gsmerge.types import LargePhotos, PicturedScene

@@ -16,7 +16,7 @@ from gsmerge.cli import main
 from gsmerge.errors import SceneError
 from gsmerge.io import write_gaussians
 from gsmerge.io.no_gaussians import POINTS_ONLY
-from gsmerge.io.scene_files import find_scene_files
+from gsmerge.reading.scene_files import find_scene_files
 
 
 def write_points(path: Path) -> None:

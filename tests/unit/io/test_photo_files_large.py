@@ -20,8 +20,8 @@ from gsmerge import Scene
 from gsmerge.errors import SceneError
 from gsmerge.fit.photo_sizes import large_photos, largest_scale
 from gsmerge.raster.metrics import psnr
+from gsmerge.reading.read_scene import load_scene
 from gsmerge.research.generate import GenerateOptions, generate_scene
-from gsmerge.scene.read import load_scene
 
 WIDTH, HEIGHT, SCALE = 48, 32, 3
 
@@ -162,14 +162,14 @@ def test_scenes_with_pixels_keep_their_grid(tmp_path: Path) -> None:
 
 def test_more_photos_than_fit_into_memory_are_resized_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """More photos than fit are resized first."""
-    monkeypatch.setattr("gsmerge.scene.views._MAX_BYTES", 3 * 52 * 39 * 12)
+    monkeypatch.setattr("gsmerge.reading.larger_photos._MAX_BYTES", 3 * 52 * 39 * 12)
     loaded = load_scene(save(tmp_path), max_side=48)
     assert NOTE in loaded.notes
     assert (loaded.scene.cameras.width, loaded.scene.cameras.height) == (48, 36)
 
 
 def test_photos_that_may_be_the_grid_are_never_resized(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gsmerge.scene.views._MAX_BYTES", 0)
+    monkeypatch.setattr("gsmerge.reading.larger_photos._MAX_BYTES", 0)
     loaded = load_scene(save(tmp_path, shuffled=False, tiny=SMOOTH), max_side=16)
     assert loaded.scene.pixels.shown.all()
     assert loaded.notes == ()

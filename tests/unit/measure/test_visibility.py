@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import scenes
 
+from gsmerge.geometry.views import resize_cameras, subset
 from gsmerge.measure import visibility
 from gsmerge.measure.visibility import context_points, visible_pixels
-from gsmerge.photos.views import resize_cameras, subset
 from gsmerge.types import Cameras, Scene
 
 

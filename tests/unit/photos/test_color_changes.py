@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from panoramas import cut_views, shrunk
 
-from gsmerge.photos.colors import (
+from gsmerge.photos.compare import are_exchanged, find_grey
+from gsmerge.photos.photo_change import LUMA, PhotoChange
+from gsmerge.reading.photos.colors import (
     Blocks,
     cut_blocks,
     explains,
@@ -21,9 +23,7 @@ from gsmerge.photos.colors import (
     tone_blocks,
     vary_in_hue,
 )
-from gsmerge.photos.compare import are_exchanged, find_grey
-from gsmerge.photos.photo_change import LUMA, PhotoChange
-from gsmerge.photos.pictures import Pairs, ViewPictures
+from gsmerge.reading.photos.view_pictures import Pairs, ViewPictures
 
 Change = Callable[[np.ndarray], np.ndarray]
 

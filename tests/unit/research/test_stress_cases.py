@@ -15,10 +15,10 @@ from sweeps import sweep
 
 from gsmerge.errors import SceneError
 from gsmerge.geometry.transforms import project
+from gsmerge.reading.held_out import read_held_out
+from gsmerge.reading.read_scene import load_scene
 from gsmerge.research import stress as module
 from gsmerge.research.stress import CASES, StressScene, stress
-from gsmerge.scene.held_out import read_held_out
-from gsmerge.scene.read import load_scene
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.types import Scene, Views
 

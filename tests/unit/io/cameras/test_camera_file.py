@@ -27,7 +27,7 @@ from gsmerge.inspection.inspect import inspect
 from gsmerge.io import read_cameras, to_cameras
 from gsmerge.io.cameras.camera_file import make_lens, select_views, undistort_photos
 from gsmerge.kernels import elementary
-from gsmerge.scene.read import load_scene
+from gsmerge.reading.read_scene import load_scene
 
 
 def test_to_cameras_scales_each_axis(tmp_path: Path, tiny: Tiny) -> None:

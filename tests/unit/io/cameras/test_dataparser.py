@@ -13,8 +13,8 @@ from sweeps import sweep
 from tiny_scene import FLIP, Tiny, frames_of, rotation, write_colmap_text, write_transforms
 
 from gsmerge.errors import SceneError
-from gsmerge.scene.held_out import read_into_frame
-from gsmerge.scene.read import load_scene
+from gsmerge.reading.held_out import read_into_frame
+from gsmerge.reading.read_scene import load_scene
 
 SMOOTH = smooth_scene(24, 18)
 TURN, SHIFT, SCALE = rotation(0.4, -1.2, 0.7), np.array([1.5, -2.0, 0.5]), 0.3

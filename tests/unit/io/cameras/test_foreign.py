@@ -12,8 +12,8 @@ from tiny_scene import Tiny, write_colmap_text, write_transforms
 from gsmerge.errors import SceneError
 from gsmerge.io import read_cameras, write_gaussians
 from gsmerge.io.cameras.foreign import PROGRAMS, find_unread
-from gsmerge.io.cameras.read import find_cameras, find_other_cameras
-from gsmerge.io.scene_files import find_scene_files
+from gsmerge.io.cameras.read_cameras import find_cameras, find_other_cameras
+from gsmerge.reading.scene_files import find_scene_files
 
 # file, its start, the program, and what is read of it
 FILES = [

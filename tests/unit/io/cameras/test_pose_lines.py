@@ -12,7 +12,7 @@ from program_cameras import HEIGHT, VIEWS, WIDTH
 
 from gsmerge.errors import SceneError
 from gsmerge.io import read_cameras
-from gsmerge.io.cameras.read import find_cameras
+from gsmerge.io.cameras.read_cameras import find_cameras
 
 W2C = scenes.arc(VIEWS, WIDTH, HEIGHT).viewmats.astype(np.float64)
 C2W = np.linalg.inv(W2C)

@@ -17,7 +17,7 @@ from gsmerge.errors import SceneError
 from gsmerge.geometry.transforms import mean_pose_frame, quat_to_rotmat, rotmat_to_quat
 from gsmerge.io import read_cameras, to_cameras
 from gsmerge.io.cameras.camera_source import CameraSource
-from gsmerge.io.cameras.read import find_cameras, find_other_cameras
+from gsmerge.io.cameras.read_cameras import find_cameras, find_other_cameras
 from gsmerge.io.cameras.read_views import read_views
 from gsmerge.io.cameras.table import CAMERA_FORMATS
 from gsmerge.io.cameras.view_layout import PinholeKeys, RotationAndShift, ViewLayout

@@ -11,9 +11,9 @@ from plyfile import PlyElement
 
 from gsmerge.errors import SceneError
 from gsmerge.io import read_ply
-from gsmerge.io.formats.read import file_notes
+from gsmerge.io.formats.read_gaussians import file_notes
 
-from .test_read import NAMES, columns, save
+from .test_read_gaussians import NAMES, columns, save
 
 MOTION = tuple(f"motion_{i}" for i in range(9))
 

@@ -6,7 +6,7 @@ from functools import partial
 
 import pytest
 
-from gsmerge.io.cameras import read as camera_reader
+from gsmerge.io.cameras import read_cameras as camera_reader
 from gsmerge.io.cameras import table as camera_table
 from gsmerge.io.cameras.table import CAMERA_FORMATS
 from gsmerge.io.cameras.view_layout import ViewLayout

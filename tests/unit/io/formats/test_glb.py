@@ -20,7 +20,7 @@ from gsmerge.geometry.transforms import multiply_quats, project, quat_to_rotmat
 from gsmerge.io import read_gaussians, write_gaussians
 from gsmerge.io.cameras.viewer_cameras import order_views
 from gsmerge.io.formats.glb import holds_gaussians
-from gsmerge.io.formats.read import file_notes
+from gsmerge.io.formats.read_gaussians import file_notes
 from gsmerge.io.formats.table import Contents
 from gsmerge.kernels.elementary import cos, sin
 

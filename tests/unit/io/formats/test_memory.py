@@ -16,7 +16,7 @@ from gsmerge.errors import SceneError
 from gsmerge.geometry.transforms import normalize
 from gsmerge.io import write_gaussians, write_ply
 from gsmerge.io.bounds import ReadBudget
-from gsmerge.io.formats.arrays import check_gaussian_count
+from gsmerge.io.formats.rows import check_gaussian_count
 from gsmerge.io.formats.sog import PACKED_BYTES
 from gsmerge.kernels import elementary
 from gsmerge.types import Gaussians

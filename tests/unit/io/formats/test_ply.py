@@ -13,12 +13,12 @@ from messages import refuses
 from gsmerge.errors import SceneError, list_doubts
 from gsmerge.io import read_gaussians, read_ply
 from gsmerge.io.formats import ply
-from gsmerge.io.formats.arrays import FileRows
 from gsmerge.io.formats.ply import header_counts, open_ply
-from gsmerge.io.formats.read import file_notes, read_parts
+from gsmerge.io.formats.read_gaussians import file_notes, read_parts
+from gsmerge.io.formats.rows import FileRows
 from gsmerge.io.formats.table import estimate_counts
 
-from .test_read import columns, save
+from .test_read_gaussians import columns, save
 
 
 @pytest.mark.parametrize("comment", [b"caf\xe9", "caf\N{LATIN SMALL LETTER E WITH ACUTE}".encode(), b"\xff" * 100])

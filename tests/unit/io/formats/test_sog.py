@@ -17,7 +17,7 @@ from slow_readers import corners, drawn
 from gsmerge import Gaussians
 from gsmerge.io import read_gaussians, write_gaussians
 from gsmerge.io.formats.sog import fit_codebook, fit_palette, nearest_codes, sog_bytes
-from gsmerge.io.scene_files import find_scene_files
+from gsmerge.reading.scene_files import find_scene_files
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from gsmerge.errors import GsmergeError, SceneError, UsageError
 from gsmerge.inspection.file_checks import check_content
 from gsmerge.io.formats import splat_transform
 from gsmerge.io.formats.splat_transform import VARIABLE
-from gsmerge.io.scene_files import find_scene_files
+from gsmerge.reading.scene_files import find_scene_files
 
 
 @pytest.mark.parametrize("name", ["a.ksplat", "my meta.lcc", "meta.lcc2"])

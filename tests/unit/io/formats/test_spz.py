@@ -20,7 +20,7 @@ from gsmerge.errors import list_doubts
 from gsmerge.geometry.transforms import covariances, rotate_harmonics
 from gsmerge.io import kept_comments, read_gaussians, write_gaussians
 from gsmerge.io.formats.glb import glb_bytes
-from gsmerge.io.formats.read import file_notes
+from gsmerge.io.formats.read_gaussians import file_notes
 from gsmerge.io.formats.splat import splat_bytes
 from gsmerge.io.formats.spz import AXIS_SYSTEMS, encode_contents, gzip_bytes, spz_bytes
 from gsmerge.io.formats.table import Contents
@@ -190,5 +190,5 @@ def test_more_than_padding_after_the_streams_is_a_doubt(
 
 def test_the_size_of_blocks_does_not_change_a_file(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = {writer: writer(corners()) for writer in (spz_bytes, splat_bytes, glb_bytes)}
-    monkeypatch.setattr("gsmerge.io.formats.arrays.BLOCK_ROWS", 3)
+    monkeypatch.setattr("gsmerge.io.formats.rows.BLOCK_ROWS", 3)
     assert {writer: writer(corners()) for writer in whole} == whole

@@ -23,7 +23,7 @@ from gsmerge.io import output_format, read_gaussians, write_gaussians
 from gsmerge.io.formats import splat_transform
 from gsmerge.io.formats.splat_transform import VARIABLE
 from gsmerge.io.formats.streamed import read_index, read_level, write_levels
-from gsmerge.scene.read import load_scene
+from gsmerge.reading.read_scene import load_scene
 
 from .test_write import psnr
 

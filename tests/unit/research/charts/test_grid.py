@@ -13,9 +13,9 @@ from messages import refuses
 
 import gsmerge
 from gsmerge.errors import SceneError, UsageError
+from gsmerge.geometry.views import subset
 from gsmerge.io.jsonl import append_line
 from gsmerge.measure.evaluate import EvaluateOptions
-from gsmerge.photos.views import subset
 from gsmerge.research.charts.grid import find_sources, list_settings, make_runs, parse_grid, scene_names
 from gsmerge.research.charts.measure_run import RUNS, ChartScene, hold_out, read_runs
 

@@ -15,9 +15,9 @@ import gsmerge
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.geometry.transforms import project
 from gsmerge.raster.metrics import psnr
+from gsmerge.reading.held_out import read_held_out
+from gsmerge.reading.read_scene import load_scene
 from gsmerge.research.generate import GenerateOptions, generate
-from gsmerge.scene.held_out import read_held_out
-from gsmerge.scene.read import load_scene
 
 TINY = GenerateOptions(views=3, width=32, height=24)
 NUM_SCENES = 2

@@ -1,0 +1,362 @@
+"""Choose cameras for rows without pixels, by the share of Gaussians that they see and by the photos' colours."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+
+from gsmerge.errors import SceneError
+from gsmerge.geometry.transforms import IDENTITY, Similarity, is_inside, project_points, sh0_to_rgb
+from gsmerge.io.cameras.camera_file import Convention
+from gsmerge.kernels.elementary import exp
+from gsmerge.kernels.matrices import invert, matmul
+from gsmerge.reading.alignment.conventions import PosesInConvention, other_conventions
+from gsmerge.reading.alignment.frames import exporter_frames
+from gsmerge.reading.alignment.grids import Grid, with_poses
+from gsmerge.reading.alignment.score import AlignmentInput, photo_colors
+from gsmerge.types import Cameras, Gaussians
+
+# Colour error, divided by the colour error of shuffled pixels, above which colours agree no better than at random
+RANDOM_SHARE = 0.85
+# Least score of another convention, divided by the score of the usual convention: _MARGIN if colours are not compared,
+# _COLOR_MARGIN if they are
+_COLOR_MARGIN, _MARGIN = 1.3, 2.0
+_FRAME_GAIN = 1.1  # least score of another frame, divided by the score of the cameras as they are
+_SEEN_GAUSSIANS = 20_000  # number of Gaussians that are projected, to estimate the share that cameras see
+# Number of Gaussians whose colours are compared in other conventions and frames. It gives scores an error of 0.4 %,
+# which is small, as the scores of two frames have to differ by 5 % or more
+_COMPARED_GAUSSIANS = 5000
+MAX_FRONT_RATIO = 0.5  # like RANDOM_SHARE, but only for the foremost Gaussians, in a frame that was chosen by colours
+# A Gaussian counts as foremost if its depth is at most _FRONT times the least depth in its cell. A cell has _PER_CELL
+# Gaussians on average
+_FRONT, _PER_CELL = 1.05, 3
+# Scales of the cameras' positions, all of which are tried. Programs that write cameras and Gaussians use units that
+# differ by factors of up to 1000
+_SCALES = np.geomspace(1 / 1300, 1300, 115)
+# For each finer search around the best scale: largest change (natural logarithm), number of scales, number of Gaussians
+_FINER = ((0.1, 11, 2000), (0.015, 7, 20_000), (0.004, 5, 20_000))
+# Places in a picture at which the middle of the Gaussians is tried, to find a shift. A place is x in widths of the
+# picture, y in heights, and the logarithm of the depth in radii of the scene. The places are a tenth of a picture
+# apart, because colours still agree if the shift is wrong by this much
+_PLACES = tuple(np.linspace(*ends).tolist() for ends in ((-0.2, 1.2, 15), (-0.2, 1.2, 15), (-1.5, 2.25, 16)))
+# For each finer search around the best places: number of Gaussians, number of places that are kept, size of a step
+_SHIFT_STEPS = [(2000 if i < 5 else 20_000, 8 if i < 5 else 1, 0.05 * 0.6**i) for i in range(10)]
+
+
+@dataclass(frozen=True)
+class CameraCheck:
+    """The share of Gaussians that cameras see, and how well the colours agree with the photos."""
+
+    share_seen: float  # share of the Gaussians that project into at least one view
+    # colour error of the Gaussians in the photos, divided by the error after shuffling the pixels; NaN without photos,
+    # or if the colours hardly vary
+    color_ratio: float
+    ok: bool  # True if these are probably the cameras of these Gaussians
+    num_compared: int = 0  # number of Gaussians whose colours were compared in at least one photo
+    ratio_error: float = np.nan  # standard error of the ratio, from sampling alone
+
+    @property
+    def score(self) -> float:
+        """Score in [0, 1] to rank cameras: the share seen, times 1 minus the colour ratio if it is known."""
+        return self.share_seen * (1.0 if np.isnan(self.color_ratio) else max(0.0, 1 - self.color_ratio))
+
+    @property
+    def description(self) -> str:
+        """Description of the measures in one sentence."""
+        seen = f"the cameras see {100 * self.share_seen:.0f} % of the Gaussians"
+        if np.isnan(self.color_ratio):
+            return seen
+        return f"{seen}, whose colours are {self.color_ratio:.2f} times as far from the photos as from random pixels"
+
+
+def check_cameras(
+    gaussians: Gaussians,
+    valid: np.ndarray,
+    cameras: Cameras,
+    images: np.ndarray,
+    samples: int = _SEEN_GAUSSIANS,
+    *,
+    foremost: bool = False,
+    hiding: np.ndarray | None = None,
+) -> CameraCheck:
+    """Measure the share of sampled Gaussians that views see, and how well their colours fit ``images [c,h,w,3]``.
+
+    About ``samples`` of the ``valid [n]`` Gaussians are measured. ``images`` may be empty. With ``foremost``, the
+    colours of hidden Gaussians do not count. ``hiding`` are further points ``[m,3]`` that hide Gaussians, but have no
+    colours themselves.
+    """
+    # fewer Gaussians are measured if otherwise more than max_projected points would be projected into all cameras
+    min_gaussians, max_projected = 200, 4_000_000
+    samples = min(samples, max(min_gaussians, max_projected // len(cameras)))
+    rows = np.flatnonzero(valid)
+    rows = rows[:: max(1, len(rows) // samples)]
+    points = gaussians.means[rows].astype(np.float64)
+    if hiding is not None:
+        points = np.concatenate([points, hiding[:: max(1, len(hiding) // samples)]])
+    colors = sh0_to_rgb(gaussians.sh0[rows, 0]).clip(0, 1)
+    # points that lie inside a view, and points whose colours are compared
+    visible, compared = np.zeros((2, len(points)), bool)
+    errors, shuffled_errors = list[np.ndarray](), list[np.ndarray]()
+    rng = np.random.default_rng(0)
+    views_at_once = 1 + _SEEN_GAUSSIANS // max(1, len(points))
+    for first_view in range(0, len(cameras), views_at_once):
+        batch = cameras[first_view : first_view + views_at_once]
+        with np.errstate(all="ignore"):
+            xy, depth = project_points(points[None], batch.viewmats, batch.Ks)
+        inside = (depth > 0) & is_inside(xy, cameras)
+        visible |= inside.any(0)
+        for view in np.flatnonzero(inside.any(1)) if len(images) else ():
+            seen = np.flatnonzero(inside[view])
+            column, row = xy[view, seen].astype(np.int64).T
+            if foremost:
+                is_front = _find_foremost(column, row, depth[view, seen], cameras.width * cameras.height)
+                is_front &= seen < len(rows)  # the points ``hiding`` have no colours
+                seen, column, row = seen[is_front], column[is_front], row[is_front]
+            photo = photo_colors(images, np.full(len(seen), first_view + view), row, column)
+            if (photo == photo[:1]).all():  # a view without a photo is black
+                continue
+            compared[seen] = True
+            errors.append(_mean_difference(colors[seen], photo))
+            shuffled_errors.append(_mean_difference(colors[seen], rng.permutation(photo)))
+    share, num_compared = float(visible[: len(rows)].sum()) / max(1, len(rows)), int(compared.sum())
+    ratio, error = _color_ratio(errors, shuffled_errors, num_compared)
+    min_seen = 0.5  # share of the Gaussians that must be in some camera
+    return CameraCheck(share, ratio, share >= min_seen and not ratio > RANDOM_SHARE, num_compared, error)
+
+
+def _color_ratio(errors: list[np.ndarray], shuffled: list[np.ndarray], count: int) -> tuple[float, float]:
+    """Divide the mean colour error by the mean colour error of shuffled pixels; also return the ratio's standard error.
+
+    ``count`` is the number of Gaussians. Both results are NaN if the colours hardly vary.
+    """
+    min_error = 0.01  # colour error of shuffled pixels below which colours vary too little to decide
+    if not errors or not (mean_shuffled := float(np.concatenate(shuffled).mean())) > min_error:
+        return np.nan, np.nan
+    ratio = float(np.concatenate(errors).mean()) / mean_shuffled
+    residuals = np.concatenate(errors) - ratio * np.concatenate(shuffled)  # with a mean of 0
+    return ratio, float(np.sqrt(np.square(residuals).mean() / count)) / mean_shuffled
+
+
+def _mean_difference(colors: np.ndarray, other_colors: np.ndarray) -> np.ndarray:
+    """Return the mean absolute difference ``[n]``, over the channels, of two arrays of colours ``[n,3]``."""
+    red, green, blue = np.abs(colors - other_colors).T
+    return np.asarray((red + green + blue) / 3)
+
+
+def _find_foremost(column: np.ndarray, row: np.ndarray, depth: np.ndarray, area: int) -> np.ndarray:
+    """Return a mask ``[n]`` of the points that are about as near to the camera as the nearest point of their cell.
+
+    ``column [n]`` and ``row [n]`` are the pixels of the points, and ``depth [n]`` their depths. A cell is a square of
+    pixels, and so large that it has a few points. The picture has ``area`` pixels.
+    """
+    if not len(row):
+        return np.zeros(0, bool)
+    side = max(1, int(np.sqrt(_PER_CELL * area / len(row))))
+    column, row = column // side, row // side
+    cells = row * (column.max() + 1) + column
+    nearest = np.full(cells.max() + 1, np.inf)
+    np.minimum.at(nearest, cells, depth)
+    return np.asarray(depth <= _FRONT * nearest[cells])
+
+
+def choose_poses(
+    gaussians: Gaussians, valid: np.ndarray, cameras: Cameras, images: np.ndarray, convention: Convention
+) -> tuple[PosesInConvention | None, CameraCheck, str | None]:
+    """Choose the pose convention in which the cameras see most Gaussians and the colours fit best.
+
+    ``cameras`` are in the usual ``convention``. ``gaussians``, ``valid`` and ``images`` are as in
+    :func:`check_cameras`. Returns:
+
+    - the poses in another convention; None if no other convention is clearly better than the usual convention
+    - the check of the chosen poses
+    - a note that another convention fits the photos as well; None if no other convention fits
+    """
+    usual = check_cameras(gaussians, valid, cameras, images)
+    candidates = [
+        (poses, check_cameras(gaussians, valid, replace(cameras, viewmats=poses.viewmats), images, _COMPARED_GAUSSIANS))
+        for poses in other_conventions(cameras.viewmats, convention)
+    ]
+    ranked = sorted(candidates, key=lambda candidate: -candidate[1].score)
+    if not ranked or not ranked[0][1].ok:
+        return None, usual, None
+    poses, best = ranked[0]
+    rivals = [usual, *(check for _, check in ranked[1:2])]
+    margin = _MARGIN if np.isnan(best.color_ratio) else _COLOR_MARGIN
+    if best.score >= margin * max((check.score for check in rivals if check.ok), default=0.0):
+        return poses, best, None
+    # Without photos there is no note, because in any scene another convention may see as many Gaussians
+    as_good = usual.ok and usual.num_compared > 0 and _FRAME_GAIN * best.score >= usual.score
+    note = f"the poses fit as well when read as {poses.description}; they are read as the format has them"
+    return None, usual, note if as_good else None
+
+
+def choose_cameras(
+    inputs: AlignmentInput, grid: Grid, frames: Sequence[Similarity], no_pixels: SceneError
+) -> tuple[Grid, list[str]]:
+    """Choose the cameras that see the Gaussians: unchanged, in another frame, or in another convention.
+
+    ``frames`` are the frames that a file gives, which are tried first. The usual frames of exporters are tried next.
+    Returns the grid with these cameras, and notes. The error ``no_pixels`` explains why the rows have no pixels. If no
+    cameras see the Gaussians, ``no_pixels`` is raised, with a sentence on what was tried.
+    """
+    rows = inputs.gaussians, inputs.valid
+    if frames:
+        tried = (IDENTITY, *frames)
+        checks = [check_cameras(*rows, frame.move_cameras(inputs.cameras), inputs.images) for frame in tried]
+        best = tried[int(np.argmax([check.score * check.ok for check in checks]))]
+        if best is not IDENTITY:
+            return replace(grid, frame=best), []
+    poses, check, note = choose_poses(*rows, inputs.cameras, inputs.images, grid.camera_file.convention)
+    frame = _choose_frame(inputs, check)
+    if frame is not None:
+        _check_colors(inputs, frame.move_cameras(inputs.cameras), frame.description, no_pixels)
+        return replace(grid, frame=frame, shown_by="photos' colours"), []
+    if not check.ok:
+        remedy = f"{no_pixels.remedy}, or write their shift (x y z) to offset.txt beside the file"
+        if check.share_seen > 0.5:  # the views see most Gaussians, so only the colours contradict the cameras
+            remedy += "; if the cameras are right, the photos or the colours of the file are wrong: --images none keeps"
+            remedy += " the cameras, and --hint colors=rgb reads f_dc as RGB"
+        raise SceneError(no_pixels.path, f"{no_pixels.problem}; {check.description}", remedy)
+    if poses is None:
+        return grid, [note] if note else []
+    cameras = replace(inputs.cameras, viewmats=poses.viewmats)
+    _check_colors(inputs, cameras, f"read as {poses.description}", no_pixels)
+    return with_poses(grid, poses), []
+
+
+def _check_colors(inputs: AlignmentInput, cameras: Cameras, name: str, no_pixels: SceneError) -> None:
+    """Raise SceneError if the colours of the foremost Gaussians do not fit the photos.
+
+    ``name`` describes the cameras in words. The message begins with the problem of ``no_pixels``.
+    """
+    ratio = check_cameras(inputs.gaussians, inputs.valid, cameras, inputs.images, foremost=True).color_ratio
+    if ratio > MAX_FRONT_RATIO:
+        measured = (
+            f"even with cameras {name} the colours of the foremost Gaussians are {ratio:.2f} times as far from the"
+            " photos as from random pixels"
+        )
+        remedy = "name the exporter with --hint exporter, export all pixels, or give cameras in the file's frame"
+        raise SceneError(no_pixels.path, f"{no_pixels.problem}; {measured}", remedy)
+
+
+def _choose_frame(inputs: AlignmentInput, usual: CameraCheck) -> Similarity | None:
+    """Choose a frame in which the colours fit the photos clearly better than in the frame of the cameras.
+
+    Returns None if no frame fits clearly better. The frames of exporters are tried. ``usual`` is the check of the
+    cameras as they are. Colours fit best at the true scale, so the chosen frame must fit better than the same frame at
+    nearby scales. If no frame stands out at the scale of the cameras, the scale is solved for.
+    """
+    if not len(inputs.images):
+        return None
+    frames = exporter_frames(inputs.cameras)
+    best, score = _best_frame(inputs, frames)
+    stands_out = _stands_out(inputs, best, score)
+    # views without a photo are black and do not count; one photo is too few, because it fits somewhere in any scene
+    if inputs.scale is None and not stands_out and inputs.images.any((1, 2, 3)).sum() > 1:
+        # frames of `exporter_frames`: rotated into the first camera, turned to y up, and moved into the first camera
+        solved = [_solve_scale(inputs, frame) for frame in (IDENTITY, frames[1], frames[4], frames[-1])]
+        best, score = _best_frame(inputs, [best, *solved, *([] if usual.ok else _solve_shift(inputs))])
+        stands_out = _stands_out(inputs, best, score)
+    if best is IDENTITY or not stands_out:
+        return None
+    usual_score = max(_score_frame(inputs, IDENTITY), usual.score if usual.ok else 0.0)
+    return best if score > _FRAME_GAIN * usual_score else None
+
+
+def _score_frame(inputs: AlignmentInput, frame: Similarity, samples: int = _COMPARED_GAUSSIANS) -> float:
+    """Return the score of the cameras in a frame, see :class:`CameraCheck`; 0 if colours cannot be compared.
+
+    ``samples`` is the number of Gaussians that are compared.
+    """
+    # the first camera does not count, because it may see all Gaussians at any scale
+    later = slice(1 if len(inputs.cameras) > 1 else 0, None)
+    cameras = frame.move_cameras(inputs.cameras)[later]
+    check = check_cameras(inputs.gaussians, inputs.valid, cameras, inputs.images[later], samples)
+    return 0.0 if np.isnan(check.color_ratio) or not check.ok else check.score
+
+
+def _best_frame(
+    inputs: AlignmentInput, frames: Iterable[Similarity], samples: int = _COMPARED_GAUSSIANS
+) -> tuple[Similarity, float]:
+    """Return the frame with the highest score, the first of several, and this score."""
+    scored = ((frame, _score_frame(inputs, frame, samples)) for frame in frames)
+    return max(scored, key=lambda frame_and_score: frame_and_score[1])
+
+
+def _stands_out(inputs: AlignmentInput, frame: Similarity, score: float) -> bool:
+    """Return True if the ``score`` of a frame is clearly higher than its scores at scales two steps of _SCALES away."""
+    two_steps = float(_SCALES[2] / _SCALES[0])
+    neighbour_scores = (_score_frame(inputs, _scale_frame(frame, factor)) for factor in (1 / two_steps, two_steps))
+    peak_gain = 1.05  # least score of a scale chosen by colours, divided by the score of a scale two steps away
+    return all(score > peak_gain * neighbour_score for neighbour_score in neighbour_scores)
+
+
+def _scale_frame(frame: Similarity, factor: float) -> Similarity:
+    """Return a frame scaled by ``factor``, about the origin of the Gaussians."""
+    scale = factor * frame.scale
+    text = f"positions scaled by {scale:.4g} (--hint scene_scale={scale:.4g})"
+    name = frame.description.partition("positions scaled")[0].removesuffix(", ")
+    words = f"{name or 'in another scale'}, {text}"
+    return replace(frame, scale=scale, shift=factor * frame.shift, description=words)
+
+
+def _solve_scale(inputs: AlignmentInput, frame: Similarity) -> Similarity:
+    """Return a frame at the scale at which its colours fit the photos best.
+
+    All scales of _SCALES are tried. Finer searches begin at the scale whose score exceeds the scores two steps away by
+    most. This score need not be the highest: far from the true scale all cameras may be in one place, so that scores
+    are high, but equal.
+    """
+    scaled = [_scale_frame(frame, float(scale)) for scale in _SCALES]
+    scale_gaussians = 2000  # Gaussians that the scales are tried on
+    scores = np.array([_score_frame(inputs, candidate, scale_gaussians) for candidate in scaled])
+    two_steps_away = np.maximum(scores[:-4], scores[4:])
+    best = scaled[2 + int(np.argmax(scores[2:-2] - two_steps_away))]
+    for max_change, num_scales, samples in _FINER:
+        factors = exp(np.linspace(-max_change, max_change, num_scales))
+        best, _ = _best_frame(inputs, [_scale_frame(best, float(factor)) for factor in factors], samples)
+    return best
+
+
+def _solve_shift(inputs: AlignmentInput) -> list[Similarity]:
+    """Solve for a shift of the cameras with which the photos show the Gaussians; return a list with one frame, or [].
+
+    The middle of the Gaussians is searched in the picture of the middle camera, at many depths.
+    """
+    max_views = 4  # views that shifts are tried on
+    first_samples, first_places = 300, 8  # number of Gaussians of the first search, and of places that it keeps
+    some_views = slice(None, None, -(-len(inputs.cameras) // max_views))
+    rows, cameras, images = (inputs.gaussians, inputs.valid), inputs.cameras[some_views], inputs.images[some_views]
+    to_world = invert(cameras.viewmats)
+    centres, points = to_world[:, :3, 3], inputs.gaussians.means[inputs.valid].astype(np.float64)
+    view = int(np.argmin(np.linalg.norm(centres - np.median(centres, 0), axis=1)))
+    middle = np.median(points, 0)
+    radius = np.median(np.linalg.norm(points - middle, axis=1))
+    to_ray = radius * matmul(to_world[view, :3, :3], invert(cameras.Ks[view]))
+
+    def make_frame(place: Sequence[float]) -> Similarity:
+        """Return the frame in which the middle of the Gaussians is at a place in the picture; see _PLACES."""
+        pixel = np.array([place[0] * cameras.width, place[1] * cameras.height, 1.0])
+        shift = middle - centres[view] - matmul(to_ray, pixel) * exp(np.array(place[2]))
+        return Similarity(np.eye(3), 1.0, shift, f"moved by {', '.join(f'{number:.10g}' for number in shift)}")
+
+    def score(place: Sequence[float], samples: int) -> float:
+        """Return the score of the cameras in the frame of a place, see _PLACES; 0 without colours to compare."""
+        check = check_cameras(*rows, make_frame(place).move_cameras(cameras), images, samples)
+        return float(np.nan_to_num(check.share_seen * (1 - check.color_ratio)))
+
+    places = sorted(product(*_PLACES), key=lambda place: -score(place, first_samples))
+    best: list[tuple[float, ...]] = places[:first_places]
+    for samples, count, step in _SHIFT_STEPS:
+        # each place is tried, and so are the places one step away along each axis
+        offsets = step * np.concatenate([np.zeros((1, 3)), np.diag((1, 1, 2.5)), -np.diag((1, 1, 2.5))])
+        around = {tuple((place + offset).tolist()) for place in best for offset in offsets}
+        best = sorted(sorted(around), key=lambda place: -score(place, samples))[:count]
+    frame = make_frame(best[0])
+    views = [(frame.move_cameras(cameras[view : view + 1]), images[view : view + 1]) for view in range(len(cameras))]
+    ratios = [check_cameras(*rows, *camera_and_image, foremost=True).color_ratio for camera_and_image in views]
+    known = [ratio for ratio in ratios if not np.isnan(ratio)]
+    return [frame] if len(known) > 1 and max(known) <= RANDOM_SHARE and np.mean(known) <= MAX_FRONT_RATIO else []

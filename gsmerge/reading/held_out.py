@@ -1,0 +1,176 @@
+"""Read held-out photos, which are compared with renders of a scene, and their cameras in the frame of the scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from gsmerge.errors import SceneError
+from gsmerge.geometry.transforms import IDENTITY, Similarity, camera_centres, fit_similarity
+from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, select_views, to_cameras, with_convention
+from gsmerge.io.cameras.read_cameras import read_cameras
+from gsmerge.io.image_names import find_image
+from gsmerge.io.photo_files import as_floats, photo_size
+from gsmerge.kernels.elementary import arccos
+from gsmerge.reading.exporters import NO_HINTS
+from gsmerge.reading.larger_photos import limit_photo_size
+from gsmerge.reading.photos.scene_photos import stored_photos
+from gsmerge.reading.read_scene import Loaded
+from gsmerge.reading.scene_files import SceneFiles
+from gsmerge.types import Scene, StrPath, Views
+
+_OPTION = "evaluate --target-images"  # `gsmerge view` does not have this option
+
+
+@dataclass(frozen=True)
+class HeldOutViews(Views):
+    """Held-out views, from which the scene was not made, in the frame of its Gaussians."""
+
+    places: tuple[int, ...]  # index of each held-out view in the camera file, which is its place along the trajectory
+    context_places: tuple[int, ...] | None  # index in this file of each view of the scene; None if it lacks a view
+    notes: tuple[str, ...] = ()  # notes on what was adapted, one sentence each
+
+
+def read_held_out(load: Loaded, cameras: StrPath, images: StrPath | None = None) -> HeldOutViews:
+    """Read held-out photos and their cameras, in any format that a scene may have.
+
+    Views from which the scene was made are left out. If the file has views of the scene under the same names, their
+    poses show how the file's world maps to the world of the Gaussians. If the poses of shared names show no such map,
+    the file is assumed to be in the world of the scene's own cameras. Poses are read in the convention in which the
+    scene's cameras fit. ``images`` is the folder of the photos; if ``images`` is None, the camera file names the
+    photos. Raises SceneError if a file is missing or damaged, or if no view remains.
+    """
+    path = Path(cameras)
+    if not path.exists():
+        raise SceneError(path, "expected cameras of held-out views, found no such file or folder")
+    camera_file, shared = read_into_frame(load, path)
+    shared |= _match_by_pose(camera_file.viewmats, load.scene)
+    places = [i for i in range(len(camera_file)) if i not in shared]
+    if not places:
+        problem = "expected held-out views, found only views that the scene was made from"
+        raise SceneError(path, problem, "name a camera file that has other views of the scene")
+    held_out = select_views(camera_file, places)
+    files = SceneFiles(load.files.ply, path, _find_photo_folder(path, held_out, images), photo_option=_OPTION)
+    photos = stored_photos(files, held_out)
+    if not len(photos):
+        root = path if path.is_dir() else path.parent
+        missing = next((name for name in held_out.names if find_image(root, name, path) is None), held_out.names[0])
+        raise SceneError(
+            path, f"expected photos of its views, found none for {missing}", f"name their folder with {_OPTION}"
+        )
+    pinholes, photos, _ = as_pinholes(held_out, photos)
+    photos, notes = limit_photo_size(photos, 0, NO_HINTS.max_side, unaligned=False)
+    place_of_view = {view: place for place, view in shared.items()}
+    has_all = 0 < len(place_of_view) == len(load.scene)
+    return HeldOutViews(
+        cameras=to_cameras(pinholes, photo_size(photos)),
+        images=as_floats(photos),
+        names=held_out.names,
+        places=tuple(places),
+        context_places=tuple(place_of_view[view] for view in range(len(load.scene))) if has_all else None,
+        notes=tuple(notes),
+    )
+
+
+def read_into_frame(load: Loaded, path: Path) -> tuple[CameraFile, dict[int, int]]:
+    """Read a camera file, and move its cameras into the frame of a scene's Gaussians; also find the shared views.
+
+    Shared views are views of the file that the scene also has. The second result maps their indices in the file to
+    their indices in the scene. Frame and convention are found as in :func:`read_held_out`.
+    """
+    stored, own_cameras = read_cameras(path), load.cameras
+    conventions = [stored]  # the cameras of the file, read in each convention
+    if own_cameras is not None and own_cameras.source == stored.source and own_cameras.convention != stored.convention:
+        conventions.insert(0, with_convention(stored, own_cameras.convention))
+    worlds = [(camera_file, *_find_world(camera_file, load)) for camera_file in conventions]
+    with_shared_views = (entry for entry in worlds if entry[2])
+    camera_file, world, shared = next(with_shared_views, worlds[0])
+    return replace(camera_file, viewmats=world.move_viewmats(camera_file.viewmats)), shared
+
+
+def _find_photo_folder(path: Path, cameras: CameraFile, images: StrPath | None) -> Path | None:
+    """Return the folder ``images``, or the camera file if it has photos inside; None if photos have to be searched.
+
+    Raises SceneError if ``images`` is no folder.
+    """
+    if images is not None:
+        if not Path(images).is_dir():
+            actual = "a file" if Path(images).exists() else "no such folder"
+            raise SceneError(images, f"expected a folder of photos, found {actual}", f"name it with {_OPTION}")
+        return Path(images)
+    return path if len(cameras.images) else None
+
+
+def _match_by_name(camera_file: CameraFile, names: tuple[str, ...]) -> dict[int, int]:
+    """Map views of a file to views of the scene with the same name, by index; {} if names are not unique.
+
+    Folders and endings of names are ignored.
+    """
+    file_views, scene_views = (
+        {PurePosixPath(name.replace("\\", "/")).stem: i for i, name in enumerate(view_names)}
+        for view_names in (camera_file.names, names)
+    )
+    if len(file_views) < len(camera_file) or len(scene_views) < len(names):
+        return {}
+    return {file_views[stem]: view for stem, view in scene_views.items() if stem in file_views}
+
+
+def _find_world(camera_file: CameraFile, load: Loaded) -> tuple[Similarity, dict[int, int]]:
+    """Find the similarity from the file's world to the world of the Gaussians, and the views that the scene also has.
+
+    The second result maps views of the file to views of the scene with the same name, by index. The map is empty if no
+    similarity brings the two poses of all shared views together.
+    """
+    stored, shared = _find_similarity(load), _match_by_name(camera_file, load.scene.names)
+    if not shared:
+        return stored, {}
+    theirs = camera_file.viewmats[list(shared)]
+    ours = load.scene.cameras.viewmats[list(shared.values())]
+    min_shared = 3  # fewest views that determine the similarity between two worlds
+    frames = [stored, fit_similarity(theirs, ours, stored.scale)] if len(shared) >= min_shared else [stored]
+    max_angle = 0.2  # degrees by which a view's two poses may differ in one frame
+    max_shift = 0.005  # largest distance between a view's two poses, relative to the extent of all views
+    for frame in frames:
+        moved, centres = frame.move_viewmats(theirs), camera_centres(ours)
+        cosines = ((moved[:, :3, :3] * ours[:, :3, :3]).sum((1, 2)) - 1) / 2
+        distance = np.linalg.norm(camera_centres(moved) - centres, axis=1).max()
+        spread = float(np.linalg.norm(np.ptp(centres, axis=0), axis=0)) or 1.0
+        angle = np.degrees(arccos(cosines.clip(-1, 1))).max()
+        if angle <= max_angle and distance / spread <= max_shift:
+            return frame, shared
+    return stored, {}
+
+
+def _find_similarity(load: Loaded) -> Similarity:
+    """Find the similarity from the world of a scene's own camera file to the world of its Gaussians.
+
+    A camera file of held-out photos is assumed to be in the world of the scene's camera file. The result is the
+    identity if the scene has no camera file, or if the poses in this file cannot be compared with the poses of the
+    scene.
+    """
+    if load.recovery is not None:
+        return load.recovery.frame
+    if load.cameras is None or load.files.cameras is None:
+        return IDENTITY
+    camera_file = read_cameras(load.files.cameras, folder=load.files.ply.parent)
+    if (camera_file.names, camera_file.convention) != (load.cameras.names, load.cameras.convention):
+        return IDENTITY  # other views, or another convention: the poses cannot be compared
+    if np.array_equal(camera_file.viewmats, load.cameras.viewmats):
+        return IDENTITY  # a fit would differ from it by rounding
+    return fit_similarity(camera_file.viewmats, load.cameras.viewmats)
+
+
+def _match_by_pose(viewmats: np.ndarray, scene: Scene) -> dict[int, int]:
+    """Map views with ``viewmats [t,4,4]`` in the scene's frame to views of the scene with the same pose, by index."""
+    if len(scene) == 0 or len(scene.gaussians) == 0:
+        return {}
+    ours, middle = scene.cameras.viewmats, np.median(scene.gaussians.means, 0)
+    # Equal poses differ by at most this in the elements of rotations, and in the centres as a share of the distance
+    # from the scene. Shifts are not compared with distances between views, because there may be a single view
+    same_pose = 1e-4
+    limit = same_pose * float(np.linalg.norm(camera_centres(ours) - middle, axis=1).max())
+    same_place = np.linalg.norm(camera_centres(viewmats)[:, None] - camera_centres(ours), axis=2) <= limit
+    same_rotation = np.abs(viewmats[:, None, :3, :3] - ours[None, :, :3, :3]).max((2, 3)) <= same_pose
+    return {int(i): int(view) for i, view in zip(*np.nonzero(same_place & same_rotation), strict=True)}

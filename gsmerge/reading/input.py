@@ -1,0 +1,74 @@
+"""Take the input of a run: check a scene in memory, or read one from a path."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from gsmerge.arrays import Array, as_array, check_numbers
+from gsmerge.errors import SceneError
+from gsmerge.io.cameras.camera_file import check_camera
+from gsmerge.reading.read_scene import load_scene
+from gsmerge.runtime.record import note
+from gsmerge.types import Scene, StrPath
+
+TOLERANCE = 1e-3  # opacities and images may lie outside [0, 1] by this much
+
+
+def as_scene(scene: Scene | StrPath) -> Scene:
+    """Check a scene and return it unchanged, or read it from a path; notes of reading go into the record of the run."""
+    if isinstance(scene, Scene):
+        check_scene(scene)
+    else:
+        load = load_scene(scene)
+        scene = replace(load.scene, notes=load.notes)
+    for text in scene.notes:
+        note(text)
+    return scene
+
+
+def check_scene(scene: Scene) -> None:
+    """Raise SceneError if values have another convention than gsmerge's, as in scenes that callers may make."""
+    gaussians, cameras = vars(scene.gaussians), scene.cameras
+    arrays = {**gaussians, "viewmats": cameras.viewmats, "Ks": cameras.Ks, "images": scene.images}
+    for name, values in arrays.items():
+        if values is not None:
+            check_numbers(name, values)
+    check_values(gaussians)
+    check_poses(as_array(cameras.viewmats), as_array(cameras.Ks))
+
+
+def check_values(columns: Mapping[str, Array]) -> None:
+    """Raise SceneError if scales are logarithms or opacities are logits. Rows that are not finite are ignored."""
+    scales, opacities = as_array(columns["scales"]), as_array(columns["opacities"])
+    if len(scales) == 0 or (_lie_within(scales, 0, np.inf) and _lie_within(opacities, 0, 1)):
+        return
+    finite = np.isfinite(scales).all(1) & np.isfinite(opacities)
+    if not finite.any():
+        return
+    scales, opacities = scales[finite], opacities[finite]
+    negative = float((scales < 0).any(1).mean())
+    if negative > 0:
+        problem = f"expected standard deviations of at least 0, found negative ones in {100 * negative:.3g} % of rows"
+        raise SceneError("scales", problem, "they look like log scales: pass scales.exp()")
+    low, high = float(opacities.min()), float(opacities.max())
+    if low < -TOLERANCE or high > 1 + TOLERANCE:
+        problem = f"expected opacities in [0, 1], found {low:.3g} to {high:.3g}"
+        raise SceneError("opacities", problem, "they look like logits: pass torch.sigmoid(opacities)")
+
+
+def _lie_within(values: np.ndarray, low: float, high: float) -> bool:
+    """Return whether all values lie between two limits. NaN is ignored."""
+    return bool(np.fmin.reduce(values, axis=None) >= low and np.fmax.reduce(values, axis=None) <= high)
+
+
+def check_poses(viewmats: np.ndarray, Ks: np.ndarray) -> None:
+    """Raise SceneError if poses ``[c,4,4]`` or intrinsics ``[c,3,3]`` are impossible, for example transposed."""
+    for view, (pose, K) in enumerate(zip(viewmats, Ks, strict=True)):
+        if np.abs(pose[3] - (0, 0, 0, 1)).max() > 1e-3:
+            problem = f"view {view}: expected 0 0 0 1 as the last row, found another"
+            raise SceneError("viewmats", problem, "if they are transposed, pass viewmats.transpose(-1, -2)")
+        check_camera("viewmats", str(view), pose, np.eye(3))
+        check_camera("Ks", str(view), np.eye(4), K)

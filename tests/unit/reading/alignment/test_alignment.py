@@ -1,0 +1,114 @@
+"""Poses in another convention than that of their format are recognised."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from exports import smooth_scene
+from messages import noted, refuses
+from sweeps import sweep
+from tiny_scene import Tiny, edited_json, make_tiny
+
+from gsmerge.errors import SceneError
+from gsmerge.io.cameras.camera_file import C2W_OPENGL, CONVENTIONS, W2C_OPENCV, from_viewmats
+from gsmerge.io.photo_files import NO_IMAGES
+from gsmerge.reading.alignment import choose_poses, other_conventions
+from gsmerge.reading.read_scene import load_scene
+from gsmerge.types import SH_C0, Cameras
+
+SMOOTH = smooth_scene(40, 30)
+
+
+def rewrite_poses(folder: Path, tiny: Tiny, convention: tuple[str, str]) -> None:
+    with edited_json(folder / "transforms.json") as data:
+        for frame, pose in zip(data["frames"], from_viewmats(tiny.w2c, convention), strict=True):
+            frame["transform_matrix"] = pose.tolist()
+
+
+def some_rows(tiny: Tiny) -> Tiny:
+    """Return two thirds of the Gaussians in a random order, a prime number: no pixels."""
+    order = np.random.default_rng(0).permutation(len(tiny.gaussians))
+    return replace(tiny, gaussians=tiny.gaussians[order[:2399]])
+
+
+@sweep("true", [c for c in CONVENTIONS if c != C2W_OPENGL], ids=" ".join)
+def test_poses_get_the_reading_that_fits_with_a_note(tiny_folder: Path, tiny: Tiny, true: tuple[str, str]) -> None:
+    rewrite_poses(tiny_folder, tiny, true)
+    loaded = load_scene(tiny_folder, order="view-major")
+    assert loaded.alignment.ok
+    assert np.allclose(loaded.scene.cameras.viewmats, tiny.w2c)
+    assert np.allclose(loaded.cameras.viewmats, tiny.w2c)
+    assert loaded.cameras.convention == true
+    assert loaded.notes == (
+        f"the poses fit when read as {true[0]} matrices with {true[1]} axes,"
+        " where this format has camera-to-world with OpenGL axes: read so",
+    )
+
+
+@sweep("true", [c for c in CONVENTIONS if c != C2W_OPENGL], ids=" ".join)
+def test_photos_tell_the_reading_of_poses_without_pixels(tmp_path: Path, true: tuple[str, str]) -> None:
+    folder = some_rows(SMOOTH).save(tmp_path / "scene")
+    rewrite_poses(folder, SMOOTH, true)
+    loaded = load_scene(folder)
+    assert not loaded.scene.has_own_pixels
+    assert np.allclose(loaded.scene.cameras.viewmats, SMOOTH.w2c)
+    assert noted(loaded.notes, *true)
+
+
+def test_poses_that_fit_as_usual_get_no_note(tmp_path: Path) -> None:
+    loaded = load_scene(some_rows(SMOOTH).save(tmp_path))
+    assert np.allclose(loaded.scene.cameras.viewmats, SMOOTH.w2c)
+    assert loaded.notes == ()
+
+
+def test_two_readings_that_fit_alike_are_noted_where_photos_fit_both() -> None:
+    """Cameras in the middle of a ball of Gaussians: both axes see the same; where photos do, too, there is a doubt."""
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(4000, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    tiny = make_tiny()
+    columns = (3 * points[:, 0] / np.abs(points[:, 2])).clip(-10, 9.5)  # where views see them, ahead or behind
+    gaussians = replace(
+        tiny.gaussians[np.arange(4000) % 840],
+        means=points.astype(np.float32),
+        sh0=np.repeat(columns[:, None, None] / 10, 3, -1),
+    )
+    viewmats = np.tile(np.eye(4), (3, 1, 1))
+    viewmats[:, 1, 3] = 0.1, 0.02, -0.1
+    viewmats[1, :3, :3] = np.diag([1, -1, -1])
+    wide = np.array([[3.0, 0, 10], [0, 3, 7], [0, 0, 1]])
+    cameras = Cameras(viewmats, np.tile(wide, (3, 1, 1)), 20, 14)
+    photos = np.broadcast_to(0.5 + SH_C0 * ((np.arange(20) - 9.5) / 10)[:, None], (3, 14, 20, 3))
+    for images, doubts in ((NO_IMAGES, False), (photos, True)):
+        poses, seen, said = choose_poses(gaussians, np.ones(4000, bool), cameras, images, W2C_OPENCV)
+        assert poses is None
+        assert seen.ok
+        assert ("fit as well when read as" in (said or "")) is doubts
+
+
+def test_a_single_pose_without_rotation_has_one_other_reading() -> None:
+    assert [p.description for p in other_conventions(np.eye(4)[None], W2C_OPENCV)] == [
+        "world-to-camera matrices with OpenGL axes"
+    ]
+
+
+def test_rows_without_finite_positions_do_not_decide_the_reading(tmp_path: Path, tiny: Tiny) -> None:
+    folder = tiny.save(tmp_path / "scene")
+    rewrite_poses(folder, tiny, W2C_OPENCV)
+    data = bytearray((folder / "scene.ply").read_bytes())
+    start = data.index(b"end_header\n") + 11
+    data[start + 5 * 68 : start + 5 * 68 + 4] = np.float32(np.nan).tobytes()
+    (folder / "scene.ply").write_bytes(data)
+    assert load_scene(folder, order="view-major").scene.pixels.shown.sum() == 839
+
+
+def test_poses_that_fit_in_no_reading_are_refused(tmp_path: Path) -> None:
+    folder = some_rows(SMOOTH).save(tmp_path / "scene")
+    away = SMOOTH.c2w.copy()
+    away[:, :3, 3] += 50
+    away[:, :3, :3] = away[:, :3, :3] @ np.diag([-1.0, 1, -1])
+    rewrite_poses(folder, replace(SMOOTH, c2w=away), C2W_OPENGL)
+    with refuses(SceneError, "scene.ply", 3600, 2399, "0 %"):
+        load_scene(folder, cameras=folder / "transforms.json")

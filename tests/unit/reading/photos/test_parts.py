@@ -1,0 +1,111 @@
+"""Photos that show more than their views are cut to a part, or all are left out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from exports import smooth_scene
+from messages import noted
+
+from gsmerge.geometry.transforms import sh0_to_rgb
+from gsmerge.io.photo_files import cut_part, part_size
+from gsmerge.reading.photos.grid_fit import PartFit, list_parts
+from gsmerge.reading.read_scene import load_scene
+
+SMOOTH = smooth_scene(48, 36)
+Change = Callable[[np.ndarray], np.ndarray]
+
+
+def other(photo: np.ndarray) -> np.ndarray:
+    """Return a picture of the same size that shows something else."""
+    return np.ascontiguousarray(cv2.GaussianBlur(photo[::-1, ::-1], (0, 0), 2))
+
+
+def write_photos(folder: Path, change: Change) -> None:
+    SMOOTH.save(folder)
+    for name, image in zip(SMOOTH.names, SMOOTH.images, strict=True):
+        assert cv2.imwrite(str(folder / "images" / name), change(image)[..., ::-1])
+
+
+CASES: dict[str, tuple[Change, tuple[object, ...]]] = {
+    "left": (lambda i: np.hstack([i, other(i)]), ("96 x 36", "48 x 36", "column 0")),
+    "below": (lambda i: np.vstack([other(i), i]), ("48 x 72", "line 36")),
+    "sheet": (lambda i: np.vstack([np.hstack([other(i)] * 2), np.hstack([other(i), i])]), ("96 x 72", "line 36")),
+    "bars": (lambda i: np.pad(i, ((9, 9), (12, 12), (0, 0))), ("bars", "72 x 54", "48 x 36")),
+    "both eyes squeezed": (
+        lambda i: cv2.resize(np.hstack([i, other(i)]), (48, 36), interpolation=cv2.INTER_AREA),
+        ("24 x 36", "2.00"),
+    ),
+    "squeezed": (lambda i: cv2.resize(i, (36, 36), interpolation=cv2.INTER_AREA), ("36 x 36", "1.33", "width")),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_part_that_fits_is_cut_out(tmp_path: Path, name: str) -> None:
+    change, words = CASES[name]
+    write_photos(tmp_path, change)
+    loaded = load_scene(tmp_path)
+    images = loaded.scene.images
+    assert noted(loaded.notes, *words)
+    assert images is not None
+    assert np.abs(images * 255 - SMOOTH.images).mean() < 6
+
+
+def test_photos_of_which_no_part_fits_are_left_out(tmp_path: Path) -> None:
+    write_photos(tmp_path, lambda i: np.hstack([other(i), other(i)]))
+    loaded = load_scene(tmp_path)
+    assert loaded.scene.images is None
+    assert len(loaded.scene) == len(SMOOTH.images)
+    assert noted(loaded.notes, tmp_path / "images", "96 x 36", "no part")
+
+
+@pytest.mark.parametrize("least", [0, 0.6], ids=["from black to white", "bright"])
+@pytest.mark.parametrize("as_rgb", [False, True])
+def test_photos_decide_whether_colors_are_rgb(tmp_path: Path, as_rgb: bool, least: float) -> None:
+    """All values lie in [0, 1]; photos are bright and faint if these are harmonics."""
+    rgb = np.clip(sh0_to_rgb(SMOOTH.gaussians.sh0), 0, 1)
+    values = least + (1 - least) * (rgb - rgb.min()) / np.ptp(rgb)
+    photos = np.round(255 * (values if as_rgb else sh0_to_rgb(values))).reshape(SMOOTH.images.shape).astype(np.uint8)
+    scene = replace(SMOOTH, images=photos, gaussians=replace(SMOOTH.gaussians, sh0=values.astype(np.float32)))
+    scene.save(tmp_path)
+    path = next(tmp_path.glob("*.ply"))
+    path.write_bytes(path.read_bytes().replace(b"comment opacity: logit\n", b""))  # as of another program
+    loaded = load_scene(tmp_path)
+    assert noted(loaded.notes, "colors=sh") == as_rgb
+    shown = sh0_to_rgb(loaded.scene.gaussians.sh0).reshape(photos.shape)
+    assert np.abs(255 * shown - photos).max() < 2
+
+
+def test_masks_are_cut_as_the_larger_photos_are(tmp_path: Path) -> None:
+    write_photos(tmp_path, lambda i: cv2.resize(np.hstack([other(i), i]), (192, 72)))
+    (tmp_path / "masks" / SMOOTH.names[0]).parent.mkdir(parents=True)
+    mask = np.zeros((72, 192), np.uint8)
+    mask[:, 144:] = 255  # the right half of the right picture
+    for name in SMOOTH.names:
+        assert cv2.imwrite(str(tmp_path / "masks" / f"{name}.png"), mask)
+    scene = load_scene(tmp_path).scene
+    assert scene.masks is not None
+    assert scene.masks[:, :, 24:].all()
+    assert not scene.masks[:, :, :24].any()
+    assert scene.large_photos is not None
+    assert (scene.large_photos.width, scene.large_photos.height) == (96, 72)
+
+
+def test_parts_have_the_shape_of_views_or_are_stretched_to_it() -> None:
+    fits = list_parts((96, 36), (48, 36), (0, 0, 1, 1))
+    for fit in fits:
+        size = part_size((96, 36), fit.part)
+        assert (fit.shape is None) == (abs(size[0] * 36 / (size[1] * 48) - 1) < 0.02)
+    assert fits[0].shape is None
+    assert fits[-1].shape == (48, 36)
+
+
+def test_part_of_a_photo_is_cut_by_shares_of_its_sides() -> None:
+    photo = np.arange(4 * 8 * 3, dtype=np.uint8).reshape(4, 8, 3)
+    assert np.array_equal(cut_part(photo, (0.5, 0.25, 1, 1)), photo[1:, 4:])
+    assert PartFit((0, 0, 0.5, 1), (8, 4)).cut(photo).shape == (4, 8, 3)
