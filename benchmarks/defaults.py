@@ -31,9 +31,9 @@ from captures import (
 from matplotlib.figure import Figure
 
 import gsmerge
-from gsmerge.facts.confirm_depths import FEWEST, MOST_PER_PIXEL, WRONG_SHARE
 from gsmerge.measure.fog import ALL
 from gsmerge.measure.scores import OUTSIDE_COLUMNS
+from gsmerge.prepare.confirm_depths import FEWEST, MOST_PER_PIXEL, WRONG_SHARE
 from gsmerge.research.charts.lines import mean_interval
 from gsmerge.types import Views
 

@@ -276,8 +276,8 @@ def prepare_section(run: Run) -> str:
     return "\n\n".join([
         "## 2. prepare: what is known first",
         text(
-            "[`facts/prepare.py`](../../gsmerge/facts/prepare.py) moves the scene into its canonical frame and",
-            "collects facts.",
+            "[`prepare/prepare_scene.py`](../../gsmerge/prepare/prepare_scene.py) moves the scene into its canonical",
+            "frame and collects facts.",
         ),
         "\n".join([
             entry("frame.origin", frame.origin),

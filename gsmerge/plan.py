@@ -15,19 +15,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gsmerge.errors import UsageError
-from gsmerge.facts.confirm_depths import FEWEST, Agreement
-from gsmerge.facts.counts import CountLimits, FileSize, count_limits, file_size, has_few_rows, max_allowed
-from gsmerge.facts.prepare import Prepared
-from gsmerge.facts.scene_size import SceneSize
 from gsmerge.fit import photo_scale, start_share
 from gsmerge.geometry.views import REPORT_VIEWS, pick_views, scored_views
-from gsmerge.photos.row_colors import RENDERS
+from gsmerge.prepare.confirm_depths import FEWEST, Agreement
+from gsmerge.prepare.prepare_scene import Prepared
+from gsmerge.prepare.row_colors import RENDERS
+from gsmerge.prepare.scene_size import SceneSize
 from gsmerge.raster.photos import scored_tiles
 from gsmerge.runtime.record import note, stage
 from gsmerge.settings.budget import AUTO
 from gsmerge.settings.compact import CHECKPOINTS, OURS, CompactOptions
 from gsmerge.settings.fit import GROW_ROUNDS, GROW_STEPS, STEPS, USUAL_SHARE, FitOptions
 from gsmerge.settings.stages import SHARE, USUAL_K, CleanOptions, DecodeOptions, MatchOptions
+from gsmerge.stages.counts import CountLimits, FileSize, count_limits, file_size, has_few_rows, max_allowed
 from gsmerge.stages.fit_pairs import choose_power
 from gsmerge.stages.pair_merge import POWERS
 from gsmerge.stages.segment import SharedTree, SuperpixelChoices
@@ -219,7 +219,7 @@ def plan_scene(
     """Make the decisions that follow from the scene's size and the options; UsageError for impossible options.
 
     Estimates, and scenes in blocks, need no more; :func:`make_plan` adds what follows from the pictures. ``num_input``:
-    see :func:`gsmerge.facts.counts.count_limits`. ``keeps``: what :func:`keeps_fidelity` has returned for the options
+    see :func:`gsmerge.stages.counts.count_limits`. ``keeps``: what :func:`keeps_fidelity` has returned for the options
     of the caller; None: what this function returns for ``options``.
     """
     effort, budget, segment = EFFORTS[options.effort], options.budget, options.segment

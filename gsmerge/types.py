@@ -331,7 +331,7 @@ class Scene(ArrayFields):
     """Gaussians, and the views from which they were made or in which they are seen.
 
     The Gaussians are the rows of a file that are finite and not empty. If reading finds the pixel of each row, the
-    scene has ``pixels``; otherwise :func:`gsmerge.facts.pixels.find_pixels` finds them later.
+    scene has ``pixels``; otherwise :func:`gsmerge.prepare.true_pixels.find_pixels` finds them later.
 
     Args:
         gaussians: n Gaussians, in the frame of the cameras.

@@ -246,7 +246,7 @@ def _list_reasons(reasons: Sequence[tuple[str, str]]) -> list[str]:
 
 def _describe_lack(report: Mapping[str, Any]) -> str:
     """Describe which files are missing for a scene without photos, and what its scores are measured on instead."""
-    from gsmerge.photos.row_colors import ROW_COLORS
+    from gsmerge.prepare.row_colors import ROW_COLORS
 
     if not report["input"]["num_views"]:
         return "no cameras found beside it or in the named folder; name them with --cameras, and photos with --images"

@@ -69,8 +69,8 @@ def read_before_after(
 
     ``files`` are the files of the scene, which may be ``loaded`` already. If it has no views, some views are placed.
     """
-    from gsmerge.facts.place_cameras import NO_VIEWS, PLACED_VIEWS, add_views
     from gsmerge.io import read_gaussians
+    from gsmerge.prepare.place_cameras import NO_VIEWS, PLACED_VIEWS, add_views
     from gsmerge.reading.read_scene import load_files
     from gsmerge.reading.scene_files import result_cameras
     from gsmerge.runtime.record import record_run

@@ -155,7 +155,7 @@ def _choose_levels(settings: CompactOptions, outputs: "Outputs", *, has_levels: 
 
     UsageError if there are several levels, or a budget in bytes, and the format cannot have these.
     """
-    from gsmerge.facts.counts import STREAMED_LEVELS
+    from gsmerge.stages.counts import STREAMED_LEVELS
 
     out, format_ = outputs.result, outputs.format
     if format_.levels == "inside" and settings.method == "gsmerge" and not has_levels:

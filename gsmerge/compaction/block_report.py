@@ -10,7 +10,7 @@ from gsmerge.compaction.block_start import BlockStart
 from gsmerge.compaction.report import CompactReport
 from gsmerge.errors import Doubt
 from gsmerge.measure.evaluate import evaluate
-from gsmerge.photos.row_colors import OWN_PHOTOS, PHOTOS
+from gsmerge.prepare.row_colors import OWN_PHOTOS, PHOTOS
 from gsmerge.raster.metrics import SAMPLE_LOSS, describe_loss, is_worse
 from gsmerge.runtime.memory import peak_memory
 from gsmerge.runtime.record import current_record

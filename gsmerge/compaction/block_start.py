@@ -8,10 +8,10 @@ import numpy as np
 
 from gsmerge.compaction.partition import Block, Covisibility, owning_views
 from gsmerge.compaction.scores import measure_input
-from gsmerge.facts.prepare import Prepared, prepare
 from gsmerge.geometry.frame import Frame
 from gsmerge.pipeline import merge_views
 from gsmerge.plan import Plan, make_plan
+from gsmerge.prepare.prepare_scene import Prepared, prepare
 from gsmerge.runtime.memory import free_pages, make_array
 from gsmerge.runtime.record import begin_part
 from gsmerge.settings.compact import CompactOptions

@@ -25,12 +25,11 @@ from gsmerge.compaction.partition import (
 from gsmerge.compaction.result import CompactResult
 from gsmerge.compaction.scores import measure_result
 from gsmerge.compaction.seams import fit_seams
-from gsmerge.facts.counts import file_size
-from gsmerge.facts.scene_size import SceneSize
 from gsmerge.fit import fit_scene, peak_weights
 from gsmerge.geometry.frame import Frame, scene_frame
 from gsmerge.geometry.views import subset
 from gsmerge.plan import WHOLE_GAUSSIANS, Plan, plan_scene
+from gsmerge.prepare.scene_size import SceneSize
 from gsmerge.raster.photos import blank_photos
 from gsmerge.runtime.memory import free_pages, memory_bytes
 from gsmerge.runtime.record import (
@@ -48,6 +47,7 @@ from gsmerge.runtime.work import start_work
 from gsmerge.settings.budget import AUTO, parse_share, share_text
 from gsmerge.settings.compact import ONE_PIECE, CompactOptions
 from gsmerge.stages.clean import faintest_dropped
+from gsmerge.stages.counts import file_size
 from gsmerge.stages.prune import split_unseen
 from gsmerge.types import Cameras, Decoded, Gaussians, Scene
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from gsmerge.compaction.scores import compares_all_pixels, measure_renders, measure_result, round_for_output
-from gsmerge.facts.prepare import Prepared
 from gsmerge.fit import Fitted
 from gsmerge.geometry.frame import scene_depth
 from gsmerge.io.cameras.camera_file import describe_moves, list_moves
-from gsmerge.photos.row_colors import RENDERS
 from gsmerge.pipeline import build
 from gsmerge.plan import Plan, own_views
+from gsmerge.prepare.prepare_scene import Prepared
+from gsmerge.prepare.row_colors import RENDERS
 from gsmerge.runtime.record import Record, begin_part, current_record, note, record_choices, record_part, stage
 from gsmerge.types import Cameras, Gaussians
 

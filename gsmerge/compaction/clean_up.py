@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-from gsmerge.facts.prepare import Prepared
 from gsmerge.fit import Fitted
 from gsmerge.pipeline import build
 from gsmerge.plan import Plan
+from gsmerge.prepare.prepare_scene import Prepared
 from gsmerge.runtime.record import Record, add_seconds, adopt, note, record_choices, record_part
 from gsmerge.stages.clean import clean, describe_counts, faintest_dropped
 from gsmerge.types import Gaussians

@@ -23,16 +23,16 @@ from gsmerge.compaction.outputs import Outputs, add_outputs, frame_notes, refuse
 from gsmerge.compaction.report import report_document
 from gsmerge.compaction.result import CompactResult, make_result
 from gsmerge.errors import Doubt, DoubtWarning, SceneError, TargetError
-from gsmerge.facts.crop import crop_scene
-from gsmerge.facts.prepare import Prepared
-from gsmerge.facts.scene_size import measure_size
 from gsmerge.io import atomic_outputs
 from gsmerge.io.formats.rounding import format_notes
 from gsmerge.io.formats.rows import result_comments
 from gsmerge.io.formats.table import Contents
-from gsmerge.photos.row_colors import RENDERS
 from gsmerge.pipeline import build
 from gsmerge.plan import Plan, choose_blocks, make_plan
+from gsmerge.prepare.crop import crop_scene
+from gsmerge.prepare.prepare_scene import Prepared
+from gsmerge.prepare.row_colors import RENDERS
+from gsmerge.prepare.scene_size import measure_size
 from gsmerge.reading.content_hash import doubt_changed
 from gsmerge.reading.exporters import NO_HINTS, ReadHints
 from gsmerge.reading.input import as_scene

@@ -13,8 +13,6 @@ import numpy as np
 from gsmerge.compaction.outputs import Outputs, frame_notes, write_outputs
 from gsmerge.compaction.placement import NUM_FULL, find_placement, move_to_frame, pad_harmonics
 from gsmerge.errors import Doubt, SceneError, UsageError, name_notes
-from gsmerge.facts.counts import STREAMED_LEVELS, level_counts
-from gsmerge.facts.place_cameras import place_viewpoints
 from gsmerge.geometry.frame import scene_frame
 from gsmerge.io import GaussianFile, file_notes, read_cameras, read_gaussians
 from gsmerge.io.cameras.camera_file import CameraFile, to_cameras
@@ -26,6 +24,7 @@ from gsmerge.io.formats.rows import RESULT_COMMENT, result_comments, states_vert
 from gsmerge.io.formats.table import Contents, Format
 from gsmerge.io.photo_files import read_images
 from gsmerge.measure.documents import document_head, note_entries
+from gsmerge.prepare.place_cameras import place_viewpoints
 from gsmerge.reading.scene_files import find_scene_files, named_path, result_cameras, scene_title
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.record import report_progress
@@ -34,6 +33,7 @@ from gsmerge.settings.placement import PlacementOptions
 from gsmerge.settings.reading import NONE, ColorChoice, OpacityChoice, ScaleChoice
 from gsmerge.settings.stages import CleanOptions
 from gsmerge.stages.clean import clean, describe_counts
+from gsmerge.stages.counts import STREAMED_LEVELS, level_counts
 from gsmerge.stages.pair_merge import merge_neighbors
 from gsmerge.types import NO_CAMERAS, Gaussians, StrPath, make_scene
 

@@ -9,9 +9,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from gsmerge.facts.prepare import Prepared
-from gsmerge.photos.row_colors import RENDERS
 from gsmerge.plan import Plan
+from gsmerge.prepare.prepare_scene import Prepared
+from gsmerge.prepare.row_colors import RENDERS
 from gsmerge.runtime.record import RunPart
 from gsmerge.settings.compact import OURS
 

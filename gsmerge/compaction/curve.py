@@ -15,11 +15,11 @@ from itertools import pairwise
 import numpy as np
 
 from gsmerge.compaction.left_out import LEAST_SEEN, LeftOut
-from gsmerge.facts.prepare import Prepared
 from gsmerge.fit.photo_sizes import holdout_psnr, training_weights
 from gsmerge.kernels.elementary import log, power
 from gsmerge.pipeline import build
 from gsmerge.plan import Plan
+from gsmerge.prepare.prepare_scene import Prepared
 from gsmerge.raster.metrics import WINDOW, ssim
 from gsmerge.raster.photos import Photos, render_photos, scene_photos
 from gsmerge.runtime.record import begin_part, record_part, report_progress

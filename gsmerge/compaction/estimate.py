@@ -16,22 +16,22 @@ from gsmerge.compaction.methods import choose_method, is_without_views
 from gsmerge.compaction.outputs import Outputs
 from gsmerge.compaction.partition import gaussians_at_once
 from gsmerge.errors import count_words
-from gsmerge.facts.confirm_depths import confirm_depths
-from gsmerge.facts.counts import level_counts
-from gsmerge.facts.crop import crop_scene
-from gsmerge.facts.prepare import views_notes, without_repeats
-from gsmerge.facts.scene_size import measure_size
 from gsmerge.geometry.frame import canonicalise
 from gsmerge.io.formats.ply import file_bytes
 from gsmerge.io.formats.table import find_format
 from gsmerge.measure.coverage import shares_inside
 from gsmerge.measure.documents import document_head, note_entries, note_lines
 from gsmerge.plan import FIDELITY_LOSS, FIDELITY_PSNR, choose_blocks, load_networks, plan_scene, resolve_budget
+from gsmerge.prepare.confirm_depths import confirm_depths
+from gsmerge.prepare.crop import crop_scene
+from gsmerge.prepare.prepare_scene import views_notes, without_repeats
+from gsmerge.prepare.scene_size import measure_size
 from gsmerge.reading.read_scene import Loaded
 from gsmerge.runtime.memory import human_bytes, memory_bytes, memory_problem
 from gsmerge.runtime.record import record_part, record_run
 from gsmerge.runtime.threads import available_threads, use_threads
 from gsmerge.settings.compact import OURS, CompactOptions
+from gsmerge.stages.counts import level_counts
 from gsmerge.types import Scene
 
 MAX_SEARCHED_GAUSSIANS = (

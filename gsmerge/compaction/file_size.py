@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 from gsmerge.compaction.candidate import Candidate, build_candidate, rescore
 from gsmerge.errors import UsageError
-from gsmerge.facts.prepare import Prepared
 from gsmerge.io.formats.rows import MIP_COMMENT, RESULT_COMMENT
 from gsmerge.io.formats.table import Contents, Format
 from gsmerge.plan import Plan
+from gsmerge.prepare.prepare_scene import Prepared
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.record import add_seconds
 from gsmerge.stages.clean import faintest_dropped

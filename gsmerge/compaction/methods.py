@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 from gsmerge.errors import UsageError
-from gsmerge.facts.prepare import Prepared, prepare
 from gsmerge.plan import Plan
+from gsmerge.prepare.prepare_scene import Prepared, prepare
 from gsmerge.runtime.plugins import METHODS, load_plugin
 from gsmerge.runtime.record import note
 from gsmerge.settings.compact import COUNTS, OURS, CompactOptions

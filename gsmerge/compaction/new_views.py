@@ -14,12 +14,12 @@ import numpy as np
 
 from gsmerge.compaction.left_out import LEAST_SEEN, choose_left_out, leave_out, mean_seen
 from gsmerge.compaction.report import CompactReport, NewViews, compared_psnr
-from gsmerge.facts.prepare import Prepared
 from gsmerge.geometry.transforms import camera_distances
 from gsmerge.geometry.views import subset
 from gsmerge.kernels.elementary import power
 from gsmerge.pipeline import build
 from gsmerge.plan import Plan
+from gsmerge.prepare.prepare_scene import Prepared
 from gsmerge.raster.photos import shrink_pictures
 from gsmerge.runtime.record import begin_part, record_part
 from gsmerge.settings.budget import parse_share

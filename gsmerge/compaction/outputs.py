@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.facts.place_cameras import place_viewpoints
 from gsmerge.io.atomic import AddOutput, atomic_outputs
 from gsmerge.io.cameras.camera_file import to_cameras
 from gsmerge.io.cameras.read_cameras import read_cameras
 from gsmerge.io.cameras.viewer_cameras import is_own_settings, viewer_cameras, viewer_cameras_path, viewer_settings
 from gsmerge.io.formats.table import TILESET, Contents, Format, output_format
+from gsmerge.prepare.place_cameras import place_viewpoints
 from gsmerge.settings.files import FileOptions
 from gsmerge.settings.placement import AXES
 from gsmerge.types import Cameras

@@ -19,11 +19,11 @@ from gsmerge.compaction.placement import NUM_FULL, pad_harmonics
 from gsmerge.compaction.report import CompactReport, compared_psnr
 from gsmerge.compaction.scores import PartScores, measure_parts, score_input
 from gsmerge.errors import count_words
-from gsmerge.facts.prepare import Prepared
 from gsmerge.io.formats.rows import result_comments
 from gsmerge.io.formats.table import Contents
-from gsmerge.photos.row_colors import OWN_PHOTOS, PHOTOS, RENDERS
 from gsmerge.plan import Plan, own_views
+from gsmerge.prepare.prepare_scene import Prepared
+from gsmerge.prepare.row_colors import OWN_PHOTOS, PHOTOS, RENDERS
 from gsmerge.raster.metrics import SAMPLE_LOSS, describe_distance, describe_loss, is_worse
 from gsmerge.runtime.arguments import check_arguments
 from gsmerge.runtime.memory import peak_memory

@@ -9,10 +9,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gsmerge.compaction.report import Covered, PhotoFiles
-from gsmerge.facts.prepare import Prepared
 from gsmerge.geometry.views import scored_views
 from gsmerge.io.formats.rounding import round_as_written
 from gsmerge.plan import Plan
+from gsmerge.prepare.prepare_scene import Prepared
 from gsmerge.raster.photos import NEAR_PLANE, WHOLE_SHARE, PhotoScore, scene_photos, score_photos
 from gsmerge.runtime.record import stage
 from gsmerge.stages.prune import ROUNDING

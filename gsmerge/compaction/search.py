@@ -13,12 +13,11 @@ from gsmerge.compaction.curve import count_reaching, count_within, curve_counts,
 from gsmerge.compaction.file_size import meet_bytes
 from gsmerge.compaction.left_out import LeftOut, choose_left_out, leave_out, mean_seen
 from gsmerge.compaction.scores import compares_all_pixels, may_leave_gaps, measure_input, measure_renders
-from gsmerge.facts.counts import level_counts
-from gsmerge.facts.prepare import LEAST_VIEWS, Prepared
 from gsmerge.kernels.elementary import exp, log, power
-from gsmerge.photos.row_colors import PHOTOS, RENDERS
 from gsmerge.pipeline import build
 from gsmerge.plan import FIDELITY_LOSS, Plan
+from gsmerge.prepare.prepare_scene import LEAST_VIEWS, Prepared
+from gsmerge.prepare.row_colors import PHOTOS, RENDERS
 from gsmerge.runtime.record import (
     RunPart,
     add_seconds,
@@ -32,6 +31,7 @@ from gsmerge.runtime.record import (
     stage,
 )
 from gsmerge.settings.stages import CleanOptions
+from gsmerge.stages.counts import level_counts
 from gsmerge.stages.segment import knee_count
 
 # The slope is the gain of PSNR (dB) per doubling of the count. Until two counts were built, a search assumes these

@@ -11,12 +11,6 @@ import numpy as np
 
 from gsmerge.compaction.estimate import estimate, estimate_lines
 from gsmerge.errors import Doubt, SceneError
-from gsmerge.facts.confirm_depths import Agreement, confirm_depths
-from gsmerge.facts.pixels import raise_sizes, with_pixels
-from gsmerge.facts.place_cameras import add_views
-from gsmerge.facts.prepare import views_notes, without_repeats
-from gsmerge.facts.scene_size import unlike_captures
-from gsmerge.facts.support import count_views_in_world
 from gsmerge.geometry.frame import canonicalise
 from gsmerge.io import GaussianFile, file_notes, kept_comments
 from gsmerge.io.formats.gsm import list_batches
@@ -26,8 +20,14 @@ from gsmerge.io.formats.rows import read_expected_scores
 from gsmerge.io.photo_files import photo_array
 from gsmerge.measure.coverage import coverage, extents
 from gsmerge.measure.documents import finite, note_entries, note_lines
-from gsmerge.photos.compare import compare_photos
 from gsmerge.plan import describe_share
+from gsmerge.prepare.compare_photos import compare_photos
+from gsmerge.prepare.confirm_depths import Agreement, confirm_depths
+from gsmerge.prepare.place_cameras import add_views
+from gsmerge.prepare.prepare_scene import views_notes, without_repeats
+from gsmerge.prepare.scene_size import unlike_captures
+from gsmerge.prepare.support import count_views_in_world
+from gsmerge.prepare.true_pixels import raise_sizes, with_pixels
 from gsmerge.raster.photos import LEAST_OPACITY
 from gsmerge.reading.alignment import check_cameras
 from gsmerge.reading.exporters import ReadHints, make_hints

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from gsmerge.errors import SceneError, UsageError, name_notes
-from gsmerge.facts.place_cameras import add_views
 from gsmerge.geometry.views import pick_views, subset
 from gsmerge.io import file_notes, read_cameras, read_gaussians, to_cameras
 from gsmerge.io.atomic import atomic_outputs, common_mode
@@ -37,6 +36,7 @@ from gsmerge.measure.preview import (
     view_pictures,
 )
 from gsmerge.measure.sizes import fill_cameras, fill_photo, shrink_cameras
+from gsmerge.prepare.place_cameras import add_views
 from gsmerge.raster import render_in_batches
 from gsmerge.raster.photos import NEAR_PLANE
 from gsmerge.reading.exporters import NO_HINTS, ReadHints

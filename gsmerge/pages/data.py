@@ -8,7 +8,6 @@ from pathlib import PurePosixPath
 
 import numpy as np
 
-from gsmerge.facts.confirm_depths import Agreement, confirm_depths
 from gsmerge.geometry.frame import Frame, scene_frame
 from gsmerge.geometry.transforms import middle_depth
 from gsmerge.geometry.views import even_views
@@ -19,6 +18,7 @@ from gsmerge.measure.evaluate import INPUT, EvaluateOptions, Evaluation, Quality
 from gsmerge.measure.lpips import lpips_available
 from gsmerge.measure.preview import OUTSIDE_VIEW, BytePicture, to_picture
 from gsmerge.pages.splats import MAX_GAUSSIANS, highest_degree, pack_splats
+from gsmerge.prepare.confirm_depths import Agreement, confirm_depths
 from gsmerge.raster import render
 from gsmerge.raster.metrics import is_worse
 from gsmerge.raster.photos import NEAR_PLANE, WHOLE_SHARE

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gsmerge.pages.data import PageView, ViewData
-from gsmerge.photos.row_colors import PHOTOS, ROW_COLORS
+from gsmerge.prepare.row_colors import PHOTOS, ROW_COLORS
 from gsmerge.runtime.memory import human_bytes, human_share
 from gsmerge.types import Cameras
 from gsmerge.version import __version__

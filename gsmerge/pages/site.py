@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
 
-from gsmerge.facts.place_cameras import place_viewpoints
 from gsmerge.geometry.transforms import middle_depth
 from gsmerge.geometry.views import even_views
 from gsmerge.io.atomic import AddOutput
@@ -17,6 +16,7 @@ from gsmerge.measure.camera_path import median_camera
 from gsmerge.measure.preview import to_picture
 from gsmerge.pages.data import encode_still
 from gsmerge.pages.page import VIEWER, base64_text, data_uri, describe_gain, page_camera, render_template
+from gsmerge.prepare.place_cameras import place_viewpoints
 from gsmerge.raster import render
 from gsmerge.types import Cameras, Gaussians
 

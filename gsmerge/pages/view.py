@@ -12,7 +12,6 @@ from tempfile import mkdtemp
 from typing import Any
 
 from gsmerge.errors import UsageError
-from gsmerge.facts.place_cameras import add_views
 from gsmerge.io.atomic import atomic_output
 from gsmerge.io.first_bytes import may_be_replaced
 from gsmerge.io.formats.ply import file_bytes
@@ -20,6 +19,7 @@ from gsmerge.io.formats.read_gaussians import GaussianFile, read_gaussians
 from gsmerge.io.formats.rows import read_expected_scores
 from gsmerge.pages.data import collect_page_data
 from gsmerge.pages.page import headline, view_page
+from gsmerge.prepare.place_cameras import add_views
 from gsmerge.reading.input import as_scene
 from gsmerge.reading.scene_files import find_scene_files, scene_title
 from gsmerge.runtime.arguments import check_arguments

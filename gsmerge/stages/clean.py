@@ -6,10 +6,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from gsmerge.facts.crop import inside_crop
-from gsmerge.facts.place_cameras import place_viewpoints
-from gsmerge.facts.support import count_views
 from gsmerge.geometry.transforms import find_nearest
+from gsmerge.prepare.crop import inside_crop
+from gsmerge.prepare.place_cameras import place_viewpoints
+from gsmerge.prepare.support import count_views
 from gsmerge.raster.photos import LEAST_OPACITY
 from gsmerge.settings.stages import CleanOptions
 from gsmerge.stages.sky import sky

@@ -13,13 +13,13 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from gsmerge.facts.holes import NEW_SIZE_PIXELS, make_round_gaussians
-from gsmerge.facts.place_cameras import between_cameras
 from gsmerge.fit.outside import Outside
 from gsmerge.geometry.transforms import is_inside, project
 from gsmerge.kernels.matrices import invert, matmul
 from gsmerge.kernels.pictures import blur
-from gsmerge.photos.row_colors import fill_gaps
+from gsmerge.prepare.fill_holes import NEW_SIZE_PIXELS, make_round_gaussians
+from gsmerge.prepare.place_cameras import between_cameras
+from gsmerge.prepare.row_colors import fill_gaps
 from gsmerge.raster import Splats, TiledView, make_splats, tile_view
 from gsmerge.raster.composite import blend, blend_depths, view_colors
 from gsmerge.raster.photos import NEAR_PLANE

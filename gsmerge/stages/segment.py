@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsmerge.facts.counts import CountLimits
 from gsmerge.geometry.transforms import camera_depths
 from gsmerge.kernels.elementary import log, log10
 from gsmerge.kernels.superpixels.merge_tree import (
@@ -29,6 +28,7 @@ from gsmerge.kernels.superpixels.ward import adjacent_pairs
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.stages import SegmentOptions
+from gsmerge.stages.counts import CountLimits
 from gsmerge.stages.superpixels import segment
 from gsmerge.types import Groups, PicturedScene, Scene, Segmentation
 

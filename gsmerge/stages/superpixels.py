@@ -17,7 +17,6 @@ import cv2
 import numpy as np
 
 from gsmerge.arrays import Array, as_array, like
-from gsmerge.facts.counts import count_for
 from gsmerge.kernels.superpixels.kd import split_rectangles
 from gsmerge.kernels.superpixels.regions import pad_labels, refine
 from gsmerge.kernels.superpixels.seeds import (
@@ -30,6 +29,7 @@ from gsmerge.kernels.superpixels.seeds import (
 from gsmerge.kernels.superpixels.ward import merge_regions
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.stages import SegmentOptions
+from gsmerge.stages.counts import count_for
 from gsmerge.types import Groups
 
 RECTANGLES, EARLY_SWEEPS = 2.0, 0  # defaults of rdseg: rectangles per superpixel, and sweeps before they are merged

@@ -12,12 +12,12 @@ from gsmerge.compaction.compact import compact_prepared
 from gsmerge.compaction.methods import choose_method
 from gsmerge.compaction.placement import pad_harmonics
 from gsmerge.errors import SceneError, split_notes
-from gsmerge.facts.confirm_depths import CHANCE_ERRORS, NORMAL_SAMPLES
-from gsmerge.facts.prepare import Prepared
 from gsmerge.geometry.transforms import camera_centres, camera_distances
 from gsmerge.geometry.views import camera_kinds, concat_cameras, in_float64, resize_cameras, subset
 from gsmerge.io.photo_files import photo_array
 from gsmerge.plan import make_plan
+from gsmerge.prepare.confirm_depths import CHANCE_ERRORS, NORMAL_SAMPLES
+from gsmerge.prepare.prepare_scene import Prepared
 from gsmerge.raster.photos import shrink_pictures
 from gsmerge.reading.alignment import check_cameras
 from gsmerge.runtime.record import Progress, record_run

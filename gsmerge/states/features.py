@@ -14,7 +14,6 @@ from typing import cast
 import numpy as np
 
 from gsmerge.errors import UsageError
-from gsmerge.facts.prepare import Prepared, prepare
 from gsmerge.geometry.frame import Frame
 from gsmerge.geometry.pooling import Members, feature_to_gaussians, gaussian_members
 from gsmerge.geometry.views import concat_cameras, resize_cameras
@@ -27,6 +26,7 @@ from gsmerge.networks.tokens import GroupFeatures, describe_features, make_group
 from gsmerge.networks.weights import NetworkWeights
 from gsmerge.pipeline import encode_groups
 from gsmerge.plan import make_plan
+from gsmerge.prepare.prepare_scene import Prepared, prepare
 from gsmerge.runtime.record import Progress, record_run, stage
 from gsmerge.runtime.threads import use_threads
 from gsmerge.settings.compact import ONE_PIECE, CompactOptions

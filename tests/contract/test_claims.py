@@ -17,8 +17,6 @@ from scripts import load_script
 import gsmerge
 from gsmerge import plan, types
 from gsmerge.compaction import blocks, curve, distance, new_views, partition, scores, seams, search
-from gsmerge.facts import confirm_depths, draw_outside, holes, move_poses, scene_size
-from gsmerge.facts.prepare import LEAST_VIEWS
 from gsmerge.fit import outside, photo_sizes, schedule, stage
 from gsmerge.fit import report as fit_report
 from gsmerge.geometry import views
@@ -29,7 +27,10 @@ from gsmerge.measure import drawings, fog
 from gsmerge.networks.checkpoint import IN_PACKAGE, load_checkpoint
 from gsmerge.networks.options import RESIDUAL, SLOTS
 from gsmerge.pages import data, splats
-from gsmerge.photos import compare, exposure
+from gsmerge.prepare import compare_photos as compare
+from gsmerge.prepare import confirm_depths, draw_outside, exposure, move_poses, scene_size
+from gsmerge.prepare import fill_holes as holes
+from gsmerge.prepare.prepare_scene import LEAST_VIEWS
 from gsmerge.raster import metrics, photos, tiled_view
 from gsmerge.reading.alignment import align_rows as rows_first
 from gsmerge.reading.alignment import score

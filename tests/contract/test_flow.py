@@ -10,10 +10,10 @@ from dataclasses import fields
 from pathlib import Path
 
 import gsmerge
-from gsmerge.facts.prepare import Prepared, PrepareOptions
+from gsmerge.prepare.prepare_scene import Prepared, PrepareOptions
 
 PACKAGE = Path(gsmerge.__file__).parent
-STEPS = ("facts", "stages", "fit")
+STEPS = ("prepare", "stages", "fit")
 
 
 @functools.cache

@@ -13,7 +13,7 @@ from shared import write_smallest
 from sweeps import sweep
 
 import gsmerge
-from gsmerge.photos.row_colors import NO_PHOTOS, ROW_COLORS
+from gsmerge.prepare.row_colors import NO_PHOTOS, ROW_COLORS
 
 from .conftest import Run
 

@@ -14,8 +14,8 @@ from scipy.spatial import cKDTree
 from sweeps import sweep
 
 from gsmerge import Scene, compact
-from gsmerge.facts.pixels import with_pixels
 from gsmerge.geometry.pooling import scene_members
+from gsmerge.prepare.true_pixels import with_pixels
 from gsmerge.stages.assign import find_owners, owner_pixels
 from gsmerge.stages.encode import member_rows
 from gsmerge.stages.segment import SegmentOptions, segment

@@ -13,7 +13,7 @@ import numpy as np
 from shared import write_scene
 from sweeps import sweep
 
-from gsmerge.facts.prepare import prepare
+from gsmerge.prepare.prepare_scene import prepare
 from gsmerge.reading.read_scene import load_scene
 from gsmerge.runtime.record import record_run
 

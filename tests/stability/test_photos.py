@@ -13,9 +13,9 @@ from messages import names, noted
 from sweeps import sweep
 
 from gsmerge import Compactor, CompactResult, Gaussians, Scene, compact, render
-from gsmerge.facts.prepare import PrepareOptions, prepare
 from gsmerge.geometry.transforms import rgb_to_sh0, sh0_to_rgb
 from gsmerge.kernels import elementary
+from gsmerge.prepare.prepare_scene import PrepareOptions, prepare
 
 Photos = np.ndarray
 Change = Callable[[Photos], Photos]

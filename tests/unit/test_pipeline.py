@@ -9,7 +9,7 @@ import scenes
 
 from gsmerge import Scene, compact
 from gsmerge.kernels import elementary
-from gsmerge.photos.row_colors import PHOTOS, ROW_COLORS
+from gsmerge.prepare.row_colors import PHOTOS, ROW_COLORS
 from gsmerge.raster.photos import scene_photos, scene_pictures, score_photos
 from gsmerge.runtime.record import STAGES
 from gsmerge.settings.stages import SEGMENTATIONS

@@ -18,9 +18,6 @@ from gsmerge.compaction.candidate import score
 from gsmerge.compaction.estimate import estimate
 from gsmerge.compaction.search import MAX_BUILDS, add_target
 from gsmerge.errors import UsageError
-from gsmerge.facts.confirm_depths import Agreement, confirm_depths
-from gsmerge.facts.prepare import prepare
-from gsmerge.facts.scene_size import SceneSize, measure_size
 from gsmerge.fit import Fitted
 from gsmerge.geometry.frame import canonicalise
 from gsmerge.geometry.views import REPORT_VIEWS
@@ -36,6 +33,9 @@ from gsmerge.plan import (
     resolve_budget,
     steps_for,
 )
+from gsmerge.prepare.confirm_depths import Agreement, confirm_depths
+from gsmerge.prepare.prepare_scene import prepare
+from gsmerge.prepare.scene_size import SceneSize, measure_size
 from gsmerge.runtime.record import record_run
 from gsmerge.settings.compact import EFFORT_NAMES as NAMES
 from gsmerge.settings.fit import GROW_STEPS

@@ -12,7 +12,13 @@ import unaligned_scenes
 
 from gsmerge import Cameras, CompactOptions, Scene, compact, render
 from gsmerge.compaction.estimate import estimate
-from gsmerge.facts.place_cameras import (
+from gsmerge.fit import Fitted
+from gsmerge.fit.outside import STEP_BACK_HIGH, STEP_BACK_LOW, outside_cameras
+from gsmerge.fit.report import FitReport
+from gsmerge.geometry.transforms import camera_centres
+from gsmerge.pipeline import build
+from gsmerge.plan import make_plan, plan_scene
+from gsmerge.prepare.place_cameras import (
     FEW_RENDERED_VIEWS,
     MOST_OUTSIDE,
     OUTSIDE_SHARE,
@@ -20,14 +26,8 @@ from gsmerge.facts.place_cameras import (
     draw_around,
     draw_pictures,
 )
-from gsmerge.facts.prepare import prepare
-from gsmerge.facts.scene_size import measure_size
-from gsmerge.fit import Fitted
-from gsmerge.fit.outside import STEP_BACK_HIGH, STEP_BACK_LOW, outside_cameras
-from gsmerge.fit.report import FitReport
-from gsmerge.geometry.transforms import camera_centres
-from gsmerge.pipeline import build
-from gsmerge.plan import make_plan, plan_scene
+from gsmerge.prepare.prepare_scene import prepare
+from gsmerge.prepare.scene_size import measure_size
 from gsmerge.raster.metrics import psnr
 from gsmerge.types import Decoded, Gaussians, Region
 

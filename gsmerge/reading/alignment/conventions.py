@@ -3,7 +3,7 @@
 If a model predicts poses, its Gaussians lie a little beside the pixels of their cameras. The pixels of a view and their
 Gaussians determine the pose of the view, and its camera is moved to this pose. If photos agree better with the poses as
 read, the Gaussians are wrong, and the result is marked as ``confirmed``. If photos of different views then disagree,
-``gsmerge/facts/move_poses.py`` moves the views later.
+``gsmerge/prepare/move_poses.py`` moves the views later.
 """
 
 from __future__ import annotations

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from made_gaussians import random_gaussians
 
-from gsmerge.facts import pixels as pixels_module
-from gsmerge.facts.pixels import find_pixels
 from gsmerge.geometry.transforms import project
 from gsmerge.kernels import elementary
 from gsmerge.kernels.gaussians.fronts import order_by_depth, project_centres, weigh_centres
+from gsmerge.prepare import true_pixels as pixels_module
+from gsmerge.prepare.true_pixels import find_pixels
 from gsmerge.types import Cameras, Gaussians, Scene
 
 WIDTH, HEIGHT, NEAR = 23, 17, 0.01

@@ -11,8 +11,8 @@ from gsmerge import CompactOptions
 from gsmerge.compaction.costs import IMPORT_SECONDS, RunCosts, usual_builds
 from gsmerge.compaction.curve import curve_counts
 from gsmerge.compaction.estimate import estimate
-from gsmerge.facts.counts import count_limits, level_counts
-from gsmerge.facts.scene_size import SceneSize
+from gsmerge.prepare.scene_size import SceneSize
+from gsmerge.stages.counts import count_limits, level_counts
 from gsmerge.types import Cameras, Scene
 
 VIEW = 480 * 320

@@ -23,9 +23,9 @@ from gsmerge.compaction.distance import (
     is_clearly_worse,
 )
 from gsmerge.errors import TargetError
-from gsmerge.facts.place_cameras import between_cameras
-from gsmerge.facts.prepare import Prepared, prepare
 from gsmerge.geometry.views import resize_cameras
+from gsmerge.prepare.place_cameras import between_cameras
+from gsmerge.prepare.prepare_scene import Prepared, prepare
 from gsmerge.raster.metrics import decibels
 
 

@@ -15,15 +15,15 @@ from gsmerge.compaction.candidate import Candidate
 from gsmerge.compaction.curve import CurvePoint, count_within, curve_counts, curve_knee
 from gsmerge.compaction.left_out import LeftOut
 from gsmerge.compaction.search import MAX_BUILDS, MAX_LEFT_OUT_BUILDS, SAME_COUNT_RATIO, CountSearch, search_count
-from gsmerge.facts.counts import exact_count, level_counts, max_allowed
-from gsmerge.facts.prepare import Prepared
 from gsmerge.fit import FitOptions, Fitted
 from gsmerge.kernels import elementary
-from gsmerge.photos.row_colors import PHOTOS
 from gsmerge.plan import FIDELITY_LOSS, Plan
+from gsmerge.prepare.prepare_scene import Prepared
+from gsmerge.prepare.row_colors import PHOTOS
 from gsmerge.runtime.record import Record
 from gsmerge.settings.budget import DEVICES, BudgetOptions, parse_share, share_text
 from gsmerge.settings.stages import CleanOptions
+from gsmerge.stages.counts import exact_count, level_counts, max_allowed
 from gsmerge.types import Cameras, Gaussians
 
 

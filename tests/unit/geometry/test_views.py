@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import scenes
 
-from gsmerge.facts.prepare import distinct_views
 from gsmerge.geometry.views import (
     MAX_SCORED_VIEWS,
     REPORT_VIEWS,
@@ -18,6 +17,7 @@ from gsmerge.geometry.views import (
     scored_views,
     subset,
 )
+from gsmerge.prepare.prepare_scene import distinct_views
 from gsmerge.types import Scene
 
 

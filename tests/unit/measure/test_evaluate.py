@@ -21,7 +21,7 @@ from gsmerge.measure.documents import to_json
 from gsmerge.measure.evaluate import INPUT, EvaluateOptions, Evaluation, evaluate, near_plane
 from gsmerge.measure.fog import measure_fog
 from gsmerge.measure.scores import CSV_COLUMNS, evaluation_csv, evaluation_document, evaluation_lines
-from gsmerge.photos.row_colors import ROW_COLORS
+from gsmerge.prepare.row_colors import ROW_COLORS
 from gsmerge.raster.photos import scene_pictures
 from gsmerge.types import Gaussians, Scene, Views
 

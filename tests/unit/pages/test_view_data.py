@@ -26,7 +26,7 @@ from gsmerge.pages import data, splats
 from gsmerge.pages.data import ViewData, collect_page_data, encode_still, short_names
 from gsmerge.pages.page import headline
 from gsmerge.pages.splats import pack_splats
-from gsmerge.photos.row_colors import ROW_COLORS
+from gsmerge.prepare.row_colors import ROW_COLORS
 from gsmerge.raster.metrics import psnr
 from gsmerge.types import Views
 

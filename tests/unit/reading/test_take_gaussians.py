@@ -13,9 +13,9 @@ from messages import noted
 from plyfile import PlyData, PlyElement
 
 from gsmerge import Gaussians, Scene
-from gsmerge.facts.prepare import prepare
 from gsmerge.io import write_ply
 from gsmerge.io.formats.read_gaussians import GaussianFile, read_ply
+from gsmerge.prepare.prepare_scene import prepare
 from gsmerge.reading.alignment import AlignmentResult
 from gsmerge.reading.read_scene import load_scene
 from gsmerge.reading.take_gaussians import take_gaussians

@@ -10,10 +10,10 @@ from motions import with_nearer_half
 
 import gsmerge
 from gsmerge import Scene
-from gsmerge.facts.confirm_depths import FEWEST, MOST_PER_PIXEL, confirm_depths
-from gsmerge.facts.prepare import prepare
 from gsmerge.geometry.pooling import scene_members
 from gsmerge.plan import make_plan
+from gsmerge.prepare.confirm_depths import FEWEST, MOST_PER_PIXEL, confirm_depths
+from gsmerge.prepare.prepare_scene import prepare
 from gsmerge.runtime.record import record_run
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.stages.encode import encode, weaken_contradicted

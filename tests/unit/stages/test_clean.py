@@ -11,8 +11,8 @@ from messages import noted, refuses
 
 from gsmerge import CompactOptions, Gaussians, Scene, compact, render
 from gsmerge.errors import UsageError
-from gsmerge.facts.crop import crop_scene, inside_crop
-from gsmerge.facts.support import count_views
+from gsmerge.prepare.crop import crop_scene, inside_crop
+from gsmerge.prepare.support import count_views
 from gsmerge.raster.metrics import decibels
 from gsmerge.runtime.threads import use_threads
 from gsmerge.settings.stages import CleanOptions, parse_crop

@@ -9,9 +9,9 @@ import pytest
 import scenes
 from messages import refuses
 
-from gsmerge.facts.counts import CountLimits
 from gsmerge.settings.stages import SegmentOptions
 from gsmerge.stages import segment as module
+from gsmerge.stages.counts import CountLimits
 from gsmerge.stages.segment import (
     RegionTree,
     SharedTree,

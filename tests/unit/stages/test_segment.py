@@ -6,8 +6,8 @@ import pytest
 import scenes
 
 from gsmerge import CompactOptions, Scene
-from gsmerge.facts.prepare import prepare
 from gsmerge.plan import make_plan
+from gsmerge.prepare.prepare_scene import prepare
 from gsmerge.stages.segment import SuperpixelChoices, segment_scene
 
 SHARE = {"superpixels": "5%"}

@@ -16,7 +16,7 @@ from gsmerge.errors import SceneError, UsageError
 from gsmerge.geometry.transforms import camera_centres
 from gsmerge.io.cameras.camera_file import to_cameras
 from gsmerge.io.cameras.read_cameras import read_cameras
-from gsmerge.photos.row_colors import PHOTOS, RENDERS, ROW_COLORS
+from gsmerge.prepare.row_colors import PHOTOS, RENDERS, ROW_COLORS
 from gsmerge.reading.read_scene import load_scene
 from gsmerge.states.extend import NOT_COMPARED, choose_distant_views, compare_worlds
 

@@ -14,7 +14,7 @@ from messages import noted, refuses
 from gsmerge import CompactOptions, Gaussians, Scene, compact
 from gsmerge.compaction.result import CompactResult
 from gsmerge.errors import UsageError
-from gsmerge.photos.row_colors import ROW_COLORS
+from gsmerge.prepare.row_colors import ROW_COLORS
 from gsmerge.runtime.plugins import METHODS, find_plugins, load_plugin
 from gsmerge.stages.superpixels import grid_labels
 

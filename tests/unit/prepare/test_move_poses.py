@@ -11,8 +11,6 @@ import scenes
 
 from gsmerge import CompactOptions, Scene, compact
 from gsmerge.compaction.clean_up import build_cleaned
-from gsmerge.facts.move_poses import CHANCE, move_poses
-from gsmerge.facts.prepare import prepare
 from gsmerge.fit import Fitted
 from gsmerge.geometry.transforms import (
     evaluate_harmonics,
@@ -25,6 +23,8 @@ from gsmerge.geometry.transforms import (
 )
 from gsmerge.geometry.transforms import without_common_motion as without_common
 from gsmerge.plan import make_plan
+from gsmerge.prepare.move_poses import CHANCE, move_poses
+from gsmerge.prepare.prepare_scene import prepare
 from gsmerge.raster import render
 from gsmerge.raster.metrics import psnr
 
@@ -84,7 +84,7 @@ def test_highlights_are_not_taken_for_wrong_poses(known: bool, scene: Scene, mon
     """The wall mirrors a lamp, whose image moves with the camera; only detail tells if Gaussians have no harmonics."""
     glossy = with_highlight(scene)
     seen = glossy if known else replace(glossy, gaussians=replace(glossy.gaussians, shN=scene.gaussians.shN))
-    monkeypatch.setattr("gsmerge.facts.move_poses.CHANCE", np.inf if known else CHANCE)
+    monkeypatch.setattr("gsmerge.prepare.move_poses.CHANCE", np.inf if known else CHANCE)
     assert move_poses(seen, VIEWS) is None
 
 

@@ -13,8 +13,8 @@ from messages import noted
 
 from gsmerge import CompactResult, Scene, compact, render
 from gsmerge.geometry.transforms import rgb_to_sh0, sh0_to_rgb
-from gsmerge.photos.compare import _note_hidden, have_other_tones
-from gsmerge.photos.row_colors import PHOTOS, ROW_COLORS
+from gsmerge.prepare.compare_photos import _note_hidden, have_other_tones
+from gsmerge.prepare.row_colors import PHOTOS, ROW_COLORS
 from gsmerge.runtime.record import record_run
 from gsmerge.types import PicturedScene
 

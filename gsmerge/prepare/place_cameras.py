@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsmerge.facts.viewer import GOLDEN, find_viewer, spread_directions
 from gsmerge.fit.outside import outside_cameras
 from gsmerge.geometry.transforms import motion_matrices, motion_vectors, nearest_views, normalize
 from gsmerge.geometry.views import concat_cameras, resize_cameras, take_rows
 from gsmerge.kernels.elementary import cos, power, sin
 from gsmerge.kernels.matrices import matmul
+from gsmerge.prepare.viewer import GOLDEN, find_viewer, spread_directions
 from gsmerge.raster import contributions, make_splats, render, tile_view
 from gsmerge.raster.images import thin_out
 from gsmerge.raster.photos import NEAR_PLANE, blank_photos

@@ -12,7 +12,7 @@ from gsmerge import Scene
 from gsmerge.geometry.frame import canonicalise
 from gsmerge.geometry.transforms import camera_distances
 from gsmerge.kernels import elementary
-from gsmerge.photos.exposure import (
+from gsmerge.prepare.exposure import (
     FARTHER_VIEWS,
     FOLLOWS,
     NEAREST_VIEWS,
@@ -60,7 +60,7 @@ def test_each_of_few_views_is_compared_with_all_others_and_of_many_with_some() -
 
 def test_gains_of_many_views_are_solved_from_some_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("NEAREST_VIEWS", "FARTHER_VIEWS"):
-        monkeypatch.setattr(f"gsmerge.photos.exposure.{name}", 4)
+        monkeypatch.setattr(f"gsmerge.prepare.exposure.{name}", 4)
     count = 16
     scene, _ = canonicalise(scenes.make_scene(scenes.room(), scenes.arc(count, 24, 16)))
     gains = grey(*np.random.default_rng(0).uniform(-0.2, 0.2, count))

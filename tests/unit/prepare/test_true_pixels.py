@@ -10,10 +10,10 @@ import scenes
 import unaligned_scenes
 
 from gsmerge import Gaussians, Scene, compact
-from gsmerge.facts.pixels import HIDDEN_SIZE, LOW_PASS, choose_level, find_pixels, raise_sizes, with_pixels
 from gsmerge.geometry.frame import canonicalise
 from gsmerge.geometry.transforms import camera_depths
 from gsmerge.kernels import elementary
+from gsmerge.prepare.true_pixels import HIDDEN_SIZE, LOW_PASS, choose_level, find_pixels, raise_sizes, with_pixels
 from gsmerge.runtime.record import record_run
 
 WIDTH, HEIGHT = 96, 72

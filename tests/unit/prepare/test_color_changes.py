@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from panoramas import cut_views, shrunk
 
-from gsmerge.photos.compare import are_exchanged, find_grey
-from gsmerge.photos.photo_change import LUMA, PhotoChange
+from gsmerge.prepare.compare_photos import are_exchanged, find_grey
+from gsmerge.prepare.photo_change import LUMA, PhotoChange
 from gsmerge.reading.photos.colors import (
     Blocks,
     cut_blocks,

@@ -12,11 +12,11 @@ from exports import da3_rows, export_rows, save_export, smooth_scene
 from messages import noted
 
 from gsmerge import compact
-from gsmerge.facts.holes import fill_holes
-from gsmerge.facts.pixels import with_pixels
-from gsmerge.facts.prepare import prepare
 from gsmerge.geometry.transforms import camera_depths, rgb_to_sh0
 from gsmerge.kernels import elementary
+from gsmerge.prepare.fill_holes import fill_holes
+from gsmerge.prepare.prepare_scene import prepare
+from gsmerge.prepare.true_pixels import with_pixels
 from gsmerge.raster import render
 from gsmerge.reading.read_scene import load_scene
 from gsmerge.runtime.record import record_run

@@ -23,7 +23,7 @@ from gsmerge.geometry.transforms import camera_distances, correlation, medians, 
 from gsmerge.kernels.compare_views import find_surfaces
 from gsmerge.kernels.elementary import exp, log
 from gsmerge.kernels.matrices import solve
-from gsmerge.photos.photo_change import CLIPPED, PhotoChange, change_large
+from gsmerge.prepare.photo_change import CLIPPED, PhotoChange, change_large
 from gsmerge.raster.photos import NEAR_PLANE
 from gsmerge.runtime.record import note, record_choices
 from gsmerge.runtime.threads import parallel_map

@@ -8,12 +8,15 @@ from functools import cached_property
 
 import numpy as np
 
-from gsmerge.facts.confirm_depths import Agreement, confirm_depths
-from gsmerge.facts.draw_outside import draw_outside
-from gsmerge.facts.holes import fill_holes
-from gsmerge.facts.move_poses import move_poses
-from gsmerge.facts.pixels import raise_sizes, with_pixels
-from gsmerge.facts.place_cameras import (
+from gsmerge.geometry.frame import Frame, canonicalise, sample_rows
+from gsmerge.geometry.views import camera_kinds, subset
+from gsmerge.prepare.compare_photos import compare_photos
+from gsmerge.prepare.confirm_depths import Agreement, confirm_depths
+from gsmerge.prepare.draw_outside import draw_outside
+from gsmerge.prepare.exposure import equalise_exposure
+from gsmerge.prepare.fill_holes import fill_holes
+from gsmerge.prepare.move_poses import move_poses
+from gsmerge.prepare.place_cameras import (
     HELD_OUT,
     NO_VIEWS,
     VIEWER_VIEWS,
@@ -23,12 +26,9 @@ from gsmerge.facts.place_cameras import (
     draw_pictures,
     place_inside,
 )
-from gsmerge.facts.scene_size import SceneSize, measure_size, unlike_captures
-from gsmerge.geometry.frame import Frame, canonicalise, sample_rows
-from gsmerge.geometry.views import camera_kinds, subset
-from gsmerge.photos.compare import compare_photos
-from gsmerge.photos.exposure import equalise_exposure
-from gsmerge.photos.row_colors import NO_PHOTOS, PHOTOS, RENDERS, ROW_COLORS, add_row_colors
+from gsmerge.prepare.row_colors import NO_PHOTOS, PHOTOS, RENDERS, ROW_COLORS, add_row_colors
+from gsmerge.prepare.scene_size import SceneSize, measure_size, unlike_captures
+from gsmerge.prepare.true_pixels import raise_sizes, with_pixels
 from gsmerge.runtime.record import note, record_choices, record_part, stage
 from gsmerge.settings.stages import Look, PrepareOptions
 from gsmerge.types import Cameras, PicturedScene, Scene

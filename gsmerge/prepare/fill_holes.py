@@ -18,8 +18,8 @@ from gsmerge.geometry.transforms import lies_inside, nearest_views, rgb_to_sh0
 from gsmerge.kernels.compare_views import add_differences
 from gsmerge.kernels.matrices import invert, matmul
 from gsmerge.kernels.pictures import blur
-from gsmerge.photos.photo_change import PhotoChange, change_large
-from gsmerge.photos.row_colors import fill_gaps
+from gsmerge.prepare.photo_change import PhotoChange, change_large
+from gsmerge.prepare.row_colors import fill_gaps
 from gsmerge.raster import TiledView
 from gsmerge.raster.composite import blend_depths
 from gsmerge.raster.images import tile_views

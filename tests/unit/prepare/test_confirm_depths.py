@@ -12,7 +12,8 @@ import unaligned_scenes
 from motions import with_nearer_half
 
 from gsmerge import Cameras, Scene
-from gsmerge.facts.confirm_depths import (
+from gsmerge.kernels.elementary import log
+from gsmerge.prepare.confirm_depths import (
     AGREEMENT_PIXELS,
     AGREEMENT_SHARE,
     FEWEST,
@@ -21,7 +22,6 @@ from gsmerge.facts.confirm_depths import (
     Agreement,
     confirm_depths,
 )
-from gsmerge.kernels.elementary import log
 
 VIEWS, WIDTH, HEIGHT = 4, 48, 36
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsmerge.facts.place_cameras import add_views, place_inside, place_viewpoints
 from gsmerge.kernels.elementary import cos, sin
+from gsmerge.prepare.place_cameras import add_views, place_inside, place_viewpoints
 from gsmerge.runtime.record import record_run
 from gsmerge.types import NO_CAMERAS, Gaussians, make_scene
 

@@ -9,7 +9,7 @@ import pytest
 import scenes
 
 from gsmerge import Gaussians
-from gsmerge.facts.support import count_views
+from gsmerge.prepare.support import count_views
 from gsmerge.raster import composite, make_splats, tile_view
 from gsmerge.raster.photos import blank_photos
 from gsmerge.types import Cameras

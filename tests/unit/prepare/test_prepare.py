@@ -9,11 +9,11 @@ import unaligned_scenes
 from messages import noted, refuses
 
 from gsmerge import Scene, render
-from gsmerge.facts.prepare import prepare
 from gsmerge.fit import FitOptions, fit_photos
 from gsmerge.geometry.frame import canonicalise, scene_frame
 from gsmerge.geometry.transforms import project
-from gsmerge.photos.row_colors import PHOTOS, ROW_COLORS
+from gsmerge.prepare.prepare_scene import prepare
+from gsmerge.prepare.row_colors import PHOTOS, ROW_COLORS
 from gsmerge.raster.photos import MASKED_WEIGHT, scene_pictures
 from gsmerge.reading.photos.scene_photos import without_photo
 from gsmerge.runtime.record import record_part

@@ -11,8 +11,8 @@ import pytest
 import scenes
 
 from gsmerge import Gaussians, Scene, compact, render
-from gsmerge.facts.holes import LARGE_SIDE, RIM_PIXELS, large_parts
-from gsmerge.facts.prepare import prepare
+from gsmerge.prepare.fill_holes import LARGE_SIDE, RIM_PIXELS, large_parts
+from gsmerge.prepare.prepare_scene import prepare
 
 WIDTH, HEIGHT, THIRD = 96, 72, 24
 AROUND = 6  # pixels beside an object into which few Gaussians reach

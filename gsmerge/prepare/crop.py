@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 
 from gsmerge.errors import UsageError
-from gsmerge.facts.holes import usual_opacity
 from gsmerge.geometry.frame import canonicalise
 from gsmerge.geometry.transforms import euler_to_rotmat, lies_inside, rgb_to_sh0
 from gsmerge.geometry.views import take_rows
+from gsmerge.prepare.fill_holes import usual_opacity
 from gsmerge.raster import render_in_batches
 from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import use_threads

@@ -17,8 +17,8 @@ from gsmerge.errors import Doubt
 from gsmerge.geometry.transforms import sh0_to_rgb
 from gsmerge.geometry.views import camera_kinds
 from gsmerge.kernels.pictures import convolve
-from gsmerge.photos.photo_change import PhotoChange, change_large
-from gsmerge.photos.row_colors import RowPicture, fill_gaps, picture_rows
+from gsmerge.prepare.photo_change import PhotoChange, change_large
+from gsmerge.prepare.row_colors import RowPicture, fill_gaps, picture_rows
 from gsmerge.raster import render
 from gsmerge.raster.photos import row_pictures
 from gsmerge.reading.photos.assign_photos import Assigner, Candidates

@@ -10,13 +10,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsmerge.facts.pixels import find_pixels
-from gsmerge.facts.place_cameras import CANDIDATE_GAUSSIANS, choose_showing
 from gsmerge.fit.outside import outside_cameras
 from gsmerge.geometry.transforms import motion_matrices
 from gsmerge.geometry.views import concat_cameras, even_views
 from gsmerge.kernels.elementary import arctan2
 from gsmerge.kernels.matrices import matmul
+from gsmerge.prepare.place_cameras import CANDIDATE_GAUSSIANS, choose_showing
+from gsmerge.prepare.true_pixels import find_pixels
 from gsmerge.raster import render
 from gsmerge.raster.images import thin_out
 from gsmerge.raster.photos import blank_photos, photo_errors

@@ -12,7 +12,7 @@ from messages import noted
 
 from gsmerge import Scene
 from gsmerge.geometry.transforms import rgb_to_sh0
-from gsmerge.photos.row_colors import FAINT_OPACITY, add_row_colors
+from gsmerge.prepare.row_colors import FAINT_OPACITY, add_row_colors
 from gsmerge.raster.photos import scene_pictures
 from gsmerge.runtime.record import record_run
 from gsmerge.types import Gaussians, Pixels

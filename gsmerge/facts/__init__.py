@@ -1,1 +1,0 @@
-"""Facts about a scene before the first stage: its frame, photos, exposures, poses, views and holes."""
