@@ -29,8 +29,8 @@ import numpy as np
 
 import gsmerge
 from gsmerge.geometry.transforms import quat_to_rotmat, rgb_to_sh0, rotmat_to_quat
-from gsmerge.measure.lpips import INSTALL, lpips, lpips_available
 from gsmerge.raster.metrics import psnr, ssim
+from gsmerge.scoring.lpips import INSTALL, lpips, lpips_available
 from gsmerge.types import Cameras, Gaussians
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL camera axes <-> OpenCV camera axes

@@ -31,10 +31,10 @@ from captures import (
 from matplotlib.figure import Figure
 
 import gsmerge
-from gsmerge.measure.fog import ALL
-from gsmerge.measure.scores import OUTSIDE_COLUMNS
 from gsmerge.prepare.confirm_depths import FEWEST, MOST_PER_PIXEL, WRONG_SHARE
 from gsmerge.research.charts.lines import mean_interval
+from gsmerge.scoring.evaluation_report import OUTSIDE_COLUMNS
+from gsmerge.scoring.fog import ALL
 from gsmerge.types import Views
 
 SEEDS = 5

@@ -23,16 +23,16 @@ from captures import Records, export_capture, make_parser, make_table, require_l
 
 import gsmerge
 from gsmerge.geometry.views import even_views, midpoint_views, pick_views, subset
-from gsmerge.measure.evaluate import EvaluateOptions, evaluate, near_plane
-from gsmerge.measure.lpips import lpips
-from gsmerge.measure.sizes import shrink_cameras, shrink_views
-from gsmerge.measure.visibility import context_points, visible_pixels
 from gsmerge.networks.checkpoint import IN_PACKAGE, load_checkpoint, save_checkpoint
 from gsmerge.networks.options import SLOTS
 from gsmerge.reading.held_out import HeldOutViews, read_held_out
 from gsmerge.reading.read_scene import load_files
 from gsmerge.reading.scene_files import find_scene_files
 from gsmerge.research.charts.lines import Interval, mean_interval
+from gsmerge.scoring.evaluate import EvaluateOptions, evaluate, near_plane
+from gsmerge.scoring.lpips import lpips
+from gsmerge.scoring.sizes import shrink_cameras, shrink_views
+from gsmerge.scoring.visibility import context_points, visible_pixels
 from gsmerge.types import Views
 
 PHOTO_SIDE = 476  # pixels on the longer side, as in the paper

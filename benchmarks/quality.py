@@ -18,8 +18,8 @@ import numpy as np
 from captures import export_capture, make_parser, parse_setting, read_held_out, require_lpips, scene_folders, score
 
 import gsmerge
-from gsmerge.measure.evaluate import near_plane
-from gsmerge.measure.fog import ALL, measure_fog
+from gsmerge.scoring.evaluate import near_plane
+from gsmerge.scoring.fog import ALL, measure_fog
 from gsmerge.types import Gaussians, Scene
 
 

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from gsmerge.compaction.report import CompactReport as CompactReport
     from gsmerge.compaction.result import CompactResult as CompactResult
     from gsmerge.compaction.tensors import compact_tensors as compact_tensors
+    from gsmerge.drawing.pages.view import view as view
     from gsmerge.errors import DoubtWarning as DoubtWarning
     from gsmerge.errors import GsmergeError as GsmergeError
     from gsmerge.errors import SceneError as SceneError
@@ -33,12 +34,11 @@ if TYPE_CHECKING:
     from gsmerge.io import write_gaussians as write_gaussians
     from gsmerge.io import write_ply as write_ply
     from gsmerge.io.formats.streamed import write_levels as write_levels
-    from gsmerge.measure.evaluate import Evaluation as Evaluation
-    from gsmerge.measure.evaluate import evaluate as evaluate
-    from gsmerge.pages.view import view as view
     from gsmerge.raster import Rendering as Rendering
     from gsmerge.raster import render as render
     from gsmerge.reading.read_scene import read_scene as read_scene
+    from gsmerge.scoring.evaluate import Evaluation as Evaluation
+    from gsmerge.scoring.evaluate import evaluate as evaluate
     from gsmerge.settings.compact import CompactOptions as CompactOptions
     from gsmerge.settings.evaluate import EvaluateOptions as EvaluateOptions
     from gsmerge.stages.superpixels import saliency as saliency
@@ -59,8 +59,8 @@ _PUBLIC = {
     "io": ("read_cameras", "read_gaussians", "read_ply", "to_cameras"),
     "io.formats.streamed": ("write_levels",),
     "io.formats.write": ("write_gaussians", "write_ply"),
-    "measure.evaluate": ("Evaluation", "evaluate"),
-    "pages.view": ("view",),
+    "scoring.evaluate": ("Evaluation", "evaluate"),
+    "drawing.pages.view": ("view",),
     "states.compactor": ("Compactor",),
     "raster": ("Rendering", "render"),
     "reading.read_scene": ("read_scene",),

@@ -17,8 +17,8 @@ from PIL import Image, ImageDraw, ImageFont
 from readme_block import find_block
 
 import gsmerge
-from gsmerge.measure.preview import to_picture
-from gsmerge.measure.sizes import zoom_cameras
+from gsmerge.drawing.preview import to_picture
+from gsmerge.scoring.sizes import zoom_cameras
 
 ROOT = Path(__file__).parents[1]
 VIEW = 2  # index of the held-out camera

@@ -20,8 +20,8 @@ import gsmerge
 from gsmerge import errors, integrations
 from gsmerge.cli.app import app
 from gsmerge.io.formats import gsm
-from gsmerge.measure import documents
 from gsmerge.networks import checkpoint
+from gsmerge.runtime import documents
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.evaluate import EvaluateOptions
 from gsmerge.settings.extend import ExtendOptions

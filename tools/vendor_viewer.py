@@ -1,4 +1,4 @@
-"""Make gsmerge/pages/vendor: Spark and three.js in one compressed file, their licences, and a record of their sources.
+"""Make gsmerge/drawing/pages/vendor: Spark and three.js in one compressed file, licences, and a record of sources.
 
 python tools/vendor_viewer.py
 
@@ -21,7 +21,7 @@ import tarfile
 import tempfile
 from pathlib import Path
 
-VENDOR = Path(__file__).parents[1] / "gsmerge" / "pages" / "vendor"
+VENDOR = Path(__file__).parents[1] / "gsmerge" / "drawing" / "pages" / "vendor"
 SCRIPT = "spark-three.js.gz"
 # Version and hash of each npm package; `npm view PACKAGE dist.integrity` prints the hash
 PACKAGES = {

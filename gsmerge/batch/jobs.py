@@ -16,10 +16,10 @@ from gsmerge.errors import SceneError, UsageError
 from gsmerge.io import OUTPUT_FORMATS
 from gsmerge.io.formats.table import estimate_counts
 from gsmerge.io.formats.write import level_output
-from gsmerge.measure.documents import SCHEMA_VERSION, file_sha256
 from gsmerge.networks.checkpoint import load_checkpoint
 from gsmerge.reading.content_hash import content_hash, digest, fill_template, list_files, scene_name
 from gsmerge.reading.scene_files import SceneFiles, find_scene_files
+from gsmerge.runtime.documents import SCHEMA_VERSION, file_sha256
 from gsmerge.runtime.memory import memory_bytes
 from gsmerge.runtime.record import list_some
 from gsmerge.settings.budget import AUTO

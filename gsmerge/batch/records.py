@@ -12,7 +12,7 @@ from typing import Any
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import check_file
 from gsmerge.io.jsonl import each_line
-from gsmerge.measure.documents import document_head, file_sha256
+from gsmerge.runtime.documents import document_head, file_sha256
 
 RECORDS = "batch.jsonl"
 DONE, FAILED = "done", "failed"  # values of `status` in records

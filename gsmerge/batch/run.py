@@ -27,7 +27,7 @@ from gsmerge.errors import SceneError, count_words, error_line
 from gsmerge.io.atomic import atomic_output, describe_existing, remove_stale
 from gsmerge.io.jsonl import append_line
 from gsmerge.io.locks import lock_file
-from gsmerge.measure.documents import file_sha256, finite
+from gsmerge.runtime.documents import file_sha256, finite
 from gsmerge.runtime.memory import free_memory
 from gsmerge.runtime.processes import ProcessPool
 from gsmerge.runtime.threads import available_threads

@@ -203,7 +203,7 @@ class Totals:
         """
         from gsmerge.batch.records import DONE, FAILED, SKIPPED
         from gsmerge.io.image_names import natural_key
-        from gsmerge.measure.documents import text_table
+        from gsmerge.runtime.documents import text_table
         from gsmerge.runtime.memory import human_share
 
         rows = [TABLE_HEADER, *sorted(self.rows, key=lambda row: natural_key(row[0]))]
@@ -277,7 +277,7 @@ def _print_plan(
 ) -> None:
     """Print which scenes a batch would compact, for ``--dry-run``; BatchError if some would fail."""
     from gsmerge.batch.run import choose_concurrency, pending_jobs
-    from gsmerge.measure.documents import document_head, note_entries
+    from gsmerge.runtime.documents import document_head, note_entries
 
     pending = pending_jobs(jobs, out, options)
     concurrency = choose_concurrency(jobs, options)

@@ -26,7 +26,7 @@ def lpips_networks(
 
     By default these are the ``usual`` networks that are installed.
     """
-    from gsmerge.measure.lpips import INSTALL, lpips_available
+    from gsmerge.scoring.lpips import INSTALL, lpips_available
 
     if choice is None:
         nets = tuple(net for net in usual if lpips_available(net))

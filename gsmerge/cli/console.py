@@ -86,7 +86,7 @@ def say(message: str, *, kind: Kind = "info", quiet: bool = False) -> None:
     if json_lines is not None:
         json_lines.print({kind: one_line(message)})
     elif not quiet:
-        from gsmerge.measure.documents import wrap_line
+        from gsmerge.runtime.documents import wrap_line
 
         text = one_line(PREFIXES[kind] + message)
         with suppress(OSError):
@@ -111,7 +111,7 @@ def print_document(
 
     ``wrap``: lines that are longer than the terminal is wide are broken between words.
     """
-    from gsmerge.measure.documents import to_json, wrap_line
+    from gsmerge.runtime.documents import to_json, wrap_line
 
     if as_json:
         sys.stdout.write(to_json(document))

@@ -53,9 +53,9 @@ def evaluate(
         if path.suffix not in SUFFIXES:
             raise UsageError(f"{path}: expected a name ending in {opt.join_words(SUFFIXES)}; gsmerge view makes pages")
     check_outputs(outputs, (*input_files(files), *after, targets, target_images), overwrite=overwrite)
-    from gsmerge.measure.documents import to_json
-    from gsmerge.measure.evaluate import evaluate as evaluate_scene
-    from gsmerge.measure.scores import evaluation_csv, evaluation_document, evaluation_lines
+    from gsmerge.runtime.documents import to_json
+    from gsmerge.scoring.evaluate import evaluate as evaluate_scene
+    from gsmerge.scoring.evaluation_report import evaluation_csv, evaluation_document, evaluation_lines
 
     with stage_progress(quiet=silent) as on_step:
         on_step("read", 0, 0)
@@ -82,7 +82,7 @@ def evaluate(
 
 def _describe_files(pair: BeforeAfter) -> dict[str, dict[str, Any]]:
     """Return path and bytes of the scene and of each compact version, by name."""
-    from gsmerge.measure.evaluate import INPUT
+    from gsmerge.scoring.evaluate import INPUT
 
     infos = {INPUT: pair.load.info, **{name: ply.info for name, ply in pair.plys.items()}}
     return {

@@ -57,7 +57,7 @@ def extend(
         if not (quiet or json):
             print_document(document, batch_line(document), as_json=False)
     if json:
-        from gsmerge.measure.documents import document_head, note_entries, to_json
+        from gsmerge.runtime.documents import document_head, note_entries, to_json
 
         notes = note_entries(note for document in documents for note in document["notes"])
         sys.stdout.write(to_json(document_head() | {"batches": documents} | notes))

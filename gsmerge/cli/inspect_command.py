@@ -38,7 +38,7 @@ def _inspect_scene(
     from gsmerge.inspection.inspect import inspect as inspect_scene
     from gsmerge.inspection.inspect import inspection_lines
     from gsmerge.io.formats.table import INDEX
-    from gsmerge.measure.documents import document_head
+    from gsmerge.runtime.documents import document_head
     from gsmerge.runtime.record import record_run
 
     with stage_progress(quiet=quiet or json) as progress, record_run(progress):
@@ -56,7 +56,7 @@ def _inspect_scene(
 def _print_checks(paths: Sequence[Path], reading: opt.Reading, *, json: bool, quiet: bool) -> None:
     """Print a line for each file; SceneError if ``compact`` refuses one."""
     from gsmerge.inspection.file_checks import FileCheck, check_content
-    from gsmerge.measure.documents import document_head, note_entries
+    from gsmerge.runtime.documents import document_head, note_entries
 
     checks, silent = list[FileCheck](), quiet or json
     with stage_progress(quiet=silent) as progress:

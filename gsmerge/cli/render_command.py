@@ -69,10 +69,10 @@ def render(
     """Draw scenes: a clip of before and after, a panel with the photos, or a picture for each camera."""
     kind = _choose_kind(output, scenes, path, frames, views)
     path = path or ("orbit" if kind == "path" else None)
-    from gsmerge.measure import drawings
-    from gsmerge.measure.camera_path import parse_camera_path
-    from gsmerge.measure.documents import document_head, note_entries
+    from gsmerge.drawing import render_files as drawings
+    from gsmerge.drawing.camera_path import parse_camera_path
     from gsmerge.reading.scene_files import find_scene_files
+    from gsmerge.runtime.documents import document_head, note_entries
 
     files = find_scene_files(scenes[0], cameras=cameras, images=images)
     framing = drawings.frame_files(files, cameras, images)
@@ -123,7 +123,7 @@ def _choose_kind(output: Path, scenes: Sequence[Path], path: str | None, frames:
 
 def _check_path(path: str, frames: Any) -> None:
     """Raise UsageError for an unknown path, or for ``--frames`` with a path that is a file."""
-    from gsmerge.measure.camera_path import parse_camera_path
+    from gsmerge.drawing.camera_path import parse_camera_path
 
     with opt.usage_errors():
         if parse_camera_path(path) is not None:

@@ -45,11 +45,11 @@ def show_page(
     overwrite: bool = False, json: bool = False, quiet: bool = False,
 ) -> None:  # fmt: skip
     """Make the page of a scene, which may be ``loaded`` already, and of its compact versions; open it if ``open``."""
+    from gsmerge.drawing.pages.data import collect_page_data
+    from gsmerge.drawing.pages.page import headline, speed, speed_words, view_page
+    from gsmerge.drawing.pages.view import check_page_name, file_gains
     from gsmerge.io.atomic import common_mode
-    from gsmerge.measure.documents import document_head, note_entries
-    from gsmerge.pages.data import collect_page_data
-    from gsmerge.pages.page import headline, speed, speed_words, view_page
-    from gsmerge.pages.view import check_page_name, file_gains
+    from gsmerge.runtime.documents import document_head, note_entries
 
     silent = quiet or json
     default = after[0].with_name(f"{after[0].stem}.compare.html") if after else files.base.with_suffix(".view.html")

@@ -9,11 +9,11 @@ import numpy as np
 from gsmerge.compaction.block_start import BlockStart
 from gsmerge.compaction.report import CompactReport
 from gsmerge.errors import Doubt
-from gsmerge.measure.evaluate import evaluate
 from gsmerge.prepare.row_colors import OWN_PHOTOS, PHOTOS
 from gsmerge.raster.metrics import SAMPLE_LOSS, describe_loss, is_worse
 from gsmerge.runtime.memory import peak_memory
 from gsmerge.runtime.record import current_record
+from gsmerge.scoring.evaluate import evaluate
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.evaluate import EvaluateOptions
 from gsmerge.types import Gaussians, Scene

@@ -23,9 +23,9 @@ from gsmerge.io.formats.rounding import format_notes
 from gsmerge.io.formats.rows import RESULT_COMMENT, result_comments, states_vertical_axis, upward_axis
 from gsmerge.io.formats.table import Contents, Format
 from gsmerge.io.photo_files import read_images
-from gsmerge.measure.documents import document_head, note_entries
 from gsmerge.prepare.place_cameras import place_viewpoints
 from gsmerge.reading.scene_files import find_scene_files, named_path, result_cameras, scene_title
+from gsmerge.runtime.documents import document_head, note_entries
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.record import report_progress
 from gsmerge.runtime.threads import use_threads

@@ -19,17 +19,17 @@ from gsmerge.errors import count_words
 from gsmerge.geometry.frame import canonicalise
 from gsmerge.io.formats.ply import file_bytes
 from gsmerge.io.formats.table import find_format
-from gsmerge.measure.coverage import shares_inside
-from gsmerge.measure.documents import document_head, note_entries, note_lines
 from gsmerge.plan import FIDELITY_LOSS, FIDELITY_PSNR, choose_blocks, load_networks, plan_scene, resolve_budget
 from gsmerge.prepare.confirm_depths import confirm_depths
 from gsmerge.prepare.crop import crop_scene
 from gsmerge.prepare.prepare_scene import views_notes, without_repeats
 from gsmerge.prepare.scene_size import measure_size
 from gsmerge.reading.read_scene import Loaded
+from gsmerge.runtime.documents import document_head, note_entries, note_lines
 from gsmerge.runtime.memory import human_bytes, memory_bytes, memory_problem
 from gsmerge.runtime.record import record_part, record_run
 from gsmerge.runtime.threads import available_threads, use_threads
+from gsmerge.scoring.coverage import shares_inside
 from gsmerge.settings.compact import OURS, CompactOptions
 from gsmerge.stages.counts import level_counts
 from gsmerge.types import Scene

@@ -9,11 +9,11 @@ from gsmerge.errors import SceneError, split_notes
 from gsmerge.io.formats.columns import list_names
 from gsmerge.io.formats.ply import is_from_gsmerge
 from gsmerge.io.formats.rows import RESULT_COMMENT
-from gsmerge.measure.documents import file_sha256
 from gsmerge.reading.content_hash import list_changed, read_stats
 from gsmerge.reading.exporters import NO_HINTS, ReadHints
 from gsmerge.reading.read_scene import Loaded, load_files
 from gsmerge.reading.scene_files import SceneFiles, result_cameras
+from gsmerge.runtime.documents import file_sha256
 from gsmerge.runtime.memory import release_memory
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.reading import OpacityChoice

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from gsmerge.geometry.views import pick_views, subset
-from gsmerge.measure.visibility import context_points, visible_pixels
 from gsmerge.plan import Plan, make_plan
 from gsmerge.prepare.prepare_scene import Prepared, Reference
 from gsmerge.prepare.row_colors import PHOTOS
 from gsmerge.raster.photos import NEAR_PLANE, Photos, scene_photos, score_photos
+from gsmerge.scoring.visibility import context_points, visible_pixels
 from gsmerge.settings.compact import OURS, TRIAL, CompactOptions
 from gsmerge.types import Gaussians, PicturedScene
 

@@ -32,7 +32,7 @@ from gsmerge.types import Cameras, Gaussians, Scene, StrPath, make_scene, number
 if TYPE_CHECKING:
     import torch
 
-    from gsmerge.pages.view import Page
+    from gsmerge.drawing.pages.view import Page
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ class CompactResult:
         ``scene`` is the input, and is only needed if the input is no longer in memory. Without an input the result is
         shown alone.
         """
-        from gsmerge.pages.view import view
+        from gsmerge.drawing.pages.view import view
 
         if scene is None:
             scene = self.scene() if isinstance(self.scene, ReferenceType) else self.scene

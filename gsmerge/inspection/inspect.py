@@ -18,8 +18,6 @@ from gsmerge.io.formats.ply import is_from_gsmerge
 from gsmerge.io.formats.read_gaussians import degree_notes
 from gsmerge.io.formats.rows import read_expected_scores
 from gsmerge.io.photo_files import photo_array
-from gsmerge.measure.coverage import coverage, extents
-from gsmerge.measure.documents import finite, note_entries, note_lines
 from gsmerge.plan import describe_share
 from gsmerge.prepare.compare_photos import compare_photos
 from gsmerge.prepare.confirm_depths import Agreement, confirm_depths
@@ -35,9 +33,11 @@ from gsmerge.reading.larger_photos import read_scene_cameras
 from gsmerge.reading.read_scene import Loaded, align_scene, read_gaussian_file
 from gsmerge.reading.scene_files import SceneFiles, find_scene_files
 from gsmerge.runtime.arguments import check_arguments
+from gsmerge.runtime.documents import finite, note_entries, note_lines
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.record import record_part, report_progress
 from gsmerge.runtime.threads import use_threads
+from gsmerge.scoring.coverage import coverage, extents
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.settings.setting import join_words

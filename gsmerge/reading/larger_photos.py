@@ -152,7 +152,7 @@ def limit_view_size(cameras: Cameras, images: np.ndarray, max_side: int) -> tupl
     """Resize cameras and photos ``[c,h,w,3]`` to at most ``max_side`` pixels per side; return them and notes.
 
     The photos look as if they had been read from files at this size. Where photos are compared with renders of another
-    size, :func:`gsmerge.measure.sizes.shrink_views` serves instead, and resizes photos as it resizes renders.
+    size, :func:`gsmerge.scoring.sizes.shrink_views` serves instead, and resizes photos as it resizes renders.
     """
     transform, notes = _choose_reduction((cameras.width, cameras.height), max_side)
     if transform is not None:

@@ -21,8 +21,8 @@ from gsmerge.errors import GsmergeError, UsageError
 from gsmerge.geometry.frame import Frame, scene_frame
 from gsmerge.geometry.transforms import move_views
 from gsmerge.geometry.views import even_views, subset, take_rows
-from gsmerge.measure.evaluate import EvaluateOptions, evaluate
 from gsmerge.runtime.record import Progress
+from gsmerge.scoring.evaluate import EvaluateOptions, evaluate
 from gsmerge.settings.budget import BudgetOptions
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.types import SH_C0, Gaussians, Scene, Views

@@ -18,10 +18,10 @@ from gsmerge.io.formats.rounding import format_notes
 from gsmerge.io.formats.rows import result_comments
 from gsmerge.io.formats.table import Contents
 from gsmerge.io.locks import lock_file
-from gsmerge.measure.documents import document_head, note_entries, seconds_document, seconds_line
 from gsmerge.reading.content_hash import content_hash, digest, doubt_changed, list_files
 from gsmerge.reading.exporters import NO_HINTS, ReadHints
 from gsmerge.reading.scene_files import SceneFiles, scene_title
+from gsmerge.runtime.documents import document_head, note_entries, seconds_document, seconds_line
 from gsmerge.runtime.memory import human_bytes, human_share, peak_memory
 from gsmerge.runtime.record import Progress
 from gsmerge.settings.extend import batch_settings

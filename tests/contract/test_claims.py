@@ -17,16 +17,16 @@ from scripts import load_script
 import gsmerge
 from gsmerge import plan, types
 from gsmerge.compaction import blocks, curve, distance, new_views, partition, scores, seams, search
+from gsmerge.drawing import render_files as drawings
+from gsmerge.drawing.pages import data, splats
 from gsmerge.fit import outside, photo_sizes, schedule, stage
 from gsmerge.fit import report as fit_report
 from gsmerge.geometry import views
 from gsmerge.io import bounds, photo_files
 from gsmerge.io.formats import ply
 from gsmerge.kernels.raster import blend
-from gsmerge.measure import drawings, fog
 from gsmerge.networks.checkpoint import IN_PACKAGE, load_checkpoint
 from gsmerge.networks.options import RESIDUAL, SLOTS
-from gsmerge.pages import data, splats
 from gsmerge.prepare import compare_photos as compare
 from gsmerge.prepare import confirm_depths, draw_outside, exposure, move_poses, scene_size
 from gsmerge.prepare import fill_holes as holes
@@ -40,6 +40,7 @@ from gsmerge.reading.held_out import read_held_out
 from gsmerge.reading.photos import colors
 from gsmerge.reading.read_scene import load_scene
 from gsmerge.runtime import memory, work
+from gsmerge.scoring import fog
 from gsmerge.settings.budget import DEVICES
 from gsmerge.settings.compact import RECIPES, method_names
 from gsmerge.settings.extend import ExtendOptions

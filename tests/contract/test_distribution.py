@@ -65,8 +65,8 @@ def test_the_wheel_holds_every_file_of_the_package(built: Path) -> None:
     names = set(zipfile.ZipFile(wheel).namelist())
     assert packed(built / "source") - names == set()
     for name in (
-        "pages/vendor/spark-three.js.gz",
-        "pages/templates/view.html",
+        "drawing/pages/vendor/spark-three.js.gz",
+        "drawing/pages/templates/view.html",
         "networks/shipped.safetensors",
         "py.typed",
     ):

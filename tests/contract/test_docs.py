@@ -21,8 +21,8 @@ import typer.main
 import gsmerge
 from gsmerge.cli.app import app
 from gsmerge.compaction.report import report_document
+from gsmerge.drawing.pages.view import Page
 from gsmerge.io.formats.table import FORMATS
-from gsmerge.pages.view import Page
 from gsmerge.settings.compact import method_names
 from gsmerge.settings.placement import PlacementOptions
 from gsmerge.settings.setting import flat_settings

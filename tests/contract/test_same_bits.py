@@ -28,7 +28,14 @@ REFUSED = {
     *(f"cv2.{name}" for name in OPENCV.split()),
 }
 # What computes no result: pages and pictures for people, research.
-OTHERS = ("pages/", "research/", "measure/clip.py", "measure/lpips.py", "measure/preview.py", "networks/tensors.py")
+OTHERS = (
+    "drawing/pages/",
+    "drawing/clip.py",
+    "drawing/preview.py",
+    "research/",
+    "scoring/lpips.py",
+    "networks/tensors.py",
+)
 ALLOWED = {
     ("io/cameras/camera_file.py", "cv2.remap"),  # of bytes: whole numbers
     ("reading/alignment/registration/keypoints.py", "@"),  # of whole numbers below 2^24, which float32 has exactly

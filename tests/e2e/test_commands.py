@@ -14,7 +14,7 @@ from tiny_scene import edited_json
 
 import gsmerge
 from gsmerge.cli import main
-from gsmerge.measure.preview import GAP_PIXELS, LABEL_HEIGHT
+from gsmerge.drawing.preview import GAP_PIXELS, LABEL_HEIGHT
 
 from .conftest import Run, listing
 

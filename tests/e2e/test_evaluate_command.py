@@ -81,9 +81,9 @@ def test_settings_choose_the_views_that_are_measured(scene: Path, run: Run) -> N
 
 def test_lpips_is_measured_with_alexnet_on_four_views(scene: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     looked = []
-    monkeypatch.setattr("gsmerge.measure.lpips.lpips_available", lambda net: True)
-    monkeypatch.setattr("gsmerge.measure.lpips.lpips", lambda image, photo, net, mask: looked.append(net) or 0.25)
-    monkeypatch.setattr("gsmerge.measure.lpips.min_size", lambda net: 1)
+    monkeypatch.setattr("gsmerge.scoring.lpips.lpips_available", lambda net: True)
+    monkeypatch.setattr("gsmerge.scoring.lpips.lpips", lambda image, photo, net, mask: looked.append(net) or 0.25)
+    monkeypatch.setattr("gsmerge.scoring.lpips.min_size", lambda net: 1)
     outcome = run("evaluate", scene, "--json", code=0)
     assert set(looked) == {"alex"}
     document = json.loads(outcome.out)

@@ -15,8 +15,8 @@ from sweeps import sweep
 
 import gsmerge
 from gsmerge.cli import main
+from gsmerge.drawing.render_files import picture_stems
 from gsmerge.kernels import elementary
-from gsmerge.measure.drawings import picture_stems
 
 from .conftest import Run, assert_refused, listing
 

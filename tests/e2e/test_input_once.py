@@ -16,8 +16,8 @@ import gsmerge.compaction.files as stage
 from gsmerge.compaction.compact import compact_files
 from gsmerge.compaction.outputs import Outputs
 from gsmerge.errors import SceneError
-from gsmerge.measure.documents import file_sha256
 from gsmerge.reading.scene_files import find_scene_files
+from gsmerge.runtime.documents import file_sha256
 from gsmerge.settings.compact import CompactOptions
 
 from .conftest import Run

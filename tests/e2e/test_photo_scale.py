@@ -14,9 +14,9 @@ from floors import nudged
 import gsmerge
 from gsmerge.geometry.views import resize_cameras
 from gsmerge.io import read_images
-from gsmerge.measure.sizes import resize_photo
 from gsmerge.raster.metrics import psnr
 from gsmerge.research.generate import GenerateOptions, NoiseOptions, generate_scene
+from gsmerge.scoring.sizes import resize_photo
 
 Floor = Callable[..., None]
 NUM_VIEWS, SUPERPIXELS = 5, 256

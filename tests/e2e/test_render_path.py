@@ -83,8 +83,8 @@ def test_captions_of_files_of_one_name_have_their_folders(
     small_copy: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked = []
-    monkeypatch.setattr("gsmerge.measure.drawings.make_captions", lambda texts, *_: asked.append(texts) or [])
-    monkeypatch.setattr("gsmerge.measure.drawings.draw_swipe", lambda pictures, *_: pictures[0])
+    monkeypatch.setattr("gsmerge.drawing.render_files.make_captions", lambda texts, *_: asked.append(texts) or [])
+    monkeypatch.setattr("gsmerge.drawing.render_files.draw_swipe", lambda pictures, *_: pictures[0])
     scene, other = small_copy / "scene.ply", tmp_path / "other" / "scene.ply"
     other.parent.mkdir()
     shutil.copy(scene, other)
@@ -149,7 +149,7 @@ def test_clips_too_large_for_the_memory_are_refused(small_scene: Path, tmp_path:
 def test_frames_grow_with_the_views_of_a_spline(
     kind: str, count: int, smallest_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gsmerge.measure.drawings.SECONDS", 0.2)
+    monkeypatch.setattr("gsmerge.drawing.render_files.SECONDS", 0.2)
     outcome = run("render", smallest_scene, "--path", kind, "-o", tmp_path / kind[:5], "--json", code=0)
     assert json.loads(outcome.out)["frames"] == count
 

@@ -15,8 +15,8 @@ from browser import CHROMIUM, Browser, browser, needs_browser
 from shared import make_once, write_small
 
 import gsmerge
-from gsmerge.measure.evaluate import near_plane
 from gsmerge.raster.metrics import psnr
+from gsmerge.scoring.evaluate import near_plane
 
 from .conftest import Run, assert_refused
 

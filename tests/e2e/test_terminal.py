@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from messages import ERROR
 
-from gsmerge.measure.documents import wrap_line
+from gsmerge.runtime.documents import wrap_line
 
 from .conftest import Run
 

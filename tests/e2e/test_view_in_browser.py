@@ -14,10 +14,10 @@ from shared import make_once, write_scene
 
 import gsmerge
 from gsmerge.cli import main
+from gsmerge.drawing.camera_path import outside_camera
 from gsmerge.geometry.transforms import middle_depth, rotmat_to_quat
-from gsmerge.measure.camera_path import outside_camera
-from gsmerge.measure.evaluate import near_plane
 from gsmerge.raster.metrics import psnr
+from gsmerge.scoring.evaluate import near_plane
 
 pytestmark = needs_browser()
 SIZE = WIDTH, HEIGHT = 72, 48

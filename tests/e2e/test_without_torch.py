@@ -18,7 +18,7 @@ from shared import make_once, write_small
 
 from gsmerge.cli import main
 from gsmerge.errors import TORCH_INSTALL
-from gsmerge.measure import lpips
+from gsmerge.scoring import lpips
 
 tomllib = pytest.importorskip("tomllib", reason="tomllib comes with Python 3.11")
 Call = Callable[..., subprocess.CompletedProcess[str]]

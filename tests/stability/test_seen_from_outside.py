@@ -12,7 +12,7 @@ from sweeps import sweep
 
 from gsmerge import Gaussians, Scene
 from gsmerge.geometry.views import concat_cameras
-from gsmerge.measure.fog import HAZE, measure_fog
+from gsmerge.scoring.fog import HAZE, measure_fog
 from gsmerge.types import Pixels
 
 SIZE = (112, 84)

@@ -112,7 +112,7 @@ class Format:
         return output.with_name(self.beside.format(stem=output.stem)) if self.beside else None
 
 
-_page = lazy_functions("gsmerge.pages")
+_page = lazy_functions("gsmerge.drawing.pages")
 # Bytes of a Gaussian with harmonics up to degree 0, 1, 2 and 3
 _SPZ = 17.0, 18.5, 18.9, 19.2
 _SOG = 13.0, 22.0, 36.5, 56.5

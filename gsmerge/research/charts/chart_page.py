@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 
-from gsmerge.measure.documents import csv_text
-from gsmerge.pages.page import PICTURES_POLICY, data_uri, render_template
+from gsmerge.drawing.pages.page import PICTURES_POLICY, data_uri, render_template
 from gsmerge.research.charts.figures import Chart
 from gsmerge.research.charts.lines import CHART_METRICS, MIN_SCENES, PARTS, Results, size_label
 from gsmerge.research.charts.measure_run import RunRecord
+from gsmerge.runtime.documents import csv_text
 
 COSTS = ("Gaussians", "Kept", "Bytes", "Seconds")
 ChartTable = tuple[Sequence[str], Sequence[Sequence[str]]]  # head and rows

@@ -12,11 +12,11 @@ from typing import Any
 from gsmerge.batch.find import find_scenes, main_file
 from gsmerge.compaction.methods import find_method
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.measure.evaluate import INPUT, EvaluateOptions
 from gsmerge.reading.content_hash import content_hash, digest, fill_template, list_files, list_photos, scene_name
 from gsmerge.reading.scene_files import SceneFiles, find_scene_files
 from gsmerge.research.charts.lines import SIZE_SETTINGS
 from gsmerge.research.charts.measure_run import ChartScene, RunRecord, describe_run
+from gsmerge.scoring.evaluate import INPUT, EvaluateOptions
 from gsmerge.settings.compact import OURS, CompactOptions
 from gsmerge.settings.setting import flat_settings
 from gsmerge.version import __version__

@@ -14,11 +14,11 @@ from gsmerge.compaction.left_out import choose_left_out
 from gsmerge.geometry.views import subset
 from gsmerge.io.formats.ply import file_bytes
 from gsmerge.io.jsonl import each_line
-from gsmerge.measure.evaluate import INPUT, EvaluateOptions, evaluate
 from gsmerge.prepare.prepare_scene import LEAST_VIEWS
 from gsmerge.reading.held_out import HeldOutViews, read_held_out
 from gsmerge.reading.read_scene import load_files
 from gsmerge.reading.scene_files import find_scene_files
+from gsmerge.scoring.evaluate import INPUT, EvaluateOptions, evaluate
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.types import Gaussians, Scene, Views
 

@@ -13,14 +13,14 @@ from gsmerge.cli.before_after import lpips_networks
 from gsmerge.cli.console import print_document, say_notes, stage_progress
 from gsmerge.cli.paths import write_texts
 from gsmerge.errors import UsageError
-from gsmerge.measure.documents import document_head, note_entries
+from gsmerge.runtime.documents import document_head, note_entries
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.evaluate import NETS
 from gsmerge.settings.setting import Settings, flat_settings, setting
 
 if TYPE_CHECKING:
-    from gsmerge.measure.evaluate import EvaluateOptions
     from gsmerge.research.charts.grid import GridRun
+    from gsmerge.scoring.evaluate import EvaluateOptions
 
 CHARTS, PAGE, TABLE = "charts", "index.html", "runs.csv"  # a folder and two files in the output folder
 
@@ -88,8 +88,8 @@ def _plan_runs(
 
     ``fixed`` are settings of compact that hold for all runs.
     """
-    from gsmerge.measure.evaluate import EvaluateOptions
     from gsmerge.research.charts.grid import find_sources, make_runs, parse_grid
+    from gsmerge.scoring.evaluate import EvaluateOptions
 
     nets, notes = lpips_networks(chart_options.lpips, NETS) if scenes else ((), [])
     measured = EvaluateOptions(nets, chart_options.lpips_views)

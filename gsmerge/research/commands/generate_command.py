@@ -40,9 +40,9 @@ def generate(
     json: opt.Json = False, progress: opt.Progress = None, quiet: opt.Quiet = False,
 ) -> None:  # fmt: skip
     """Make synthetic scenes to train and test with, as a feed-forward network would export them."""
-    from gsmerge.measure.documents import document_head, note_entries
     from gsmerge.research.generate import GenerateOptions
     from gsmerge.research.generate import generate as generate_scenes
+    from gsmerge.runtime.documents import document_head, note_entries
 
     given, (width, height) = opt.read_settings(SETTINGS, set), size
     options, series = given.make(GenerateOptions, SeriesOptions, views=views, width=width, height=height)

@@ -35,10 +35,10 @@ def stress(
     json: opt.Json = False, progress: opt.Progress = None, quiet: opt.Quiet = False,
 ) -> None:  # fmt: skip
     """Compact a scene under bad conditions, and report for each condition if the required property holds."""
-    from gsmerge.measure.documents import document_head, note_entries
     from gsmerge.reading.read_scene import load_files
     from gsmerge.reading.scene_files import find_scene_files
     from gsmerge.research.stress import stress as stress_scene
+    from gsmerge.runtime.documents import document_head, note_entries
 
     settings, places = opt.read_settings(SETTINGS, set).make(*SETTINGS)
     cameras, images = opt.path_or_none(places.cameras), opt.path_or_none(places.images)

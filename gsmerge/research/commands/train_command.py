@@ -27,9 +27,9 @@ def train(
     json: opt.Json = False, progress: opt.Progress = None, quiet: opt.Quiet = False,
 ) -> None:  # fmt: skip
     """Train networks on scenes and their photos; after an interruption the same call resumes the run."""
-    from gsmerge.measure.documents import document_head, note_entries
     from gsmerge.research.training import prepare_shards, preset_options
     from gsmerge.research.training import train as train_networks
+    from gsmerge.runtime.documents import document_head, note_entries
     from gsmerge.runtime.threads import use_threads
 
     given = opt.read_settings((OPTIONS,), set)

@@ -2,7 +2,7 @@
 
 All Feature Gaussians that reach into a window of a photo run through all networks, and the window is rendered from them
 (paper section 4.6). Pixels that the scene does not cover have no loss, so networks need not guess them. LPIPS has the
-values of :mod:`gsmerge.measure.lpips`, and torch can differentiate it. Two regularizers act in early training. One
+values of :mod:`gsmerge.scoring.lpips`, and torch can differentiate it. Two regularizers act in early training. One
 penalises Gaussians that are far from the moments of their groups (the "teacher" of the paper). The other penalises
 children of one group that lie upon each other.
 """
@@ -19,7 +19,6 @@ from torch import Tensor
 from torch.nn import functional
 
 from gsmerge.geometry.pooling import Members, pool_members, to_gaussians
-from gsmerge.measure.lpips import EPSILON, INPUT_SCALE, INPUT_SHIFT, Convolution, min_size, read_layers
 from gsmerge.networks.tensors import gaussian_sizes, quat_to_rotmat, skew_vectors
 from gsmerge.raster.autograd import render_tensors
 from gsmerge.raster.photos import NEAR_PLANE
@@ -28,6 +27,7 @@ from gsmerge.research.training.modules import Networks
 from gsmerge.research.training.predict import Prediction, analytic_gaussians, decode_crop, predict, refine_crop
 from gsmerge.research.training.train_options import TrainOptions
 from gsmerge.research.training.windows import Window
+from gsmerge.scoring.lpips import EPSILON, INPUT_SCALE, INPUT_SHIFT, Convolution, min_size, read_layers
 from gsmerge.types import SH_C0, Gaussians
 
 

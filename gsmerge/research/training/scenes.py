@@ -10,11 +10,11 @@ import numpy as np
 from gsmerge.geometry.frame import canonicalise
 from gsmerge.geometry.pooling import Members, scene_members
 from gsmerge.geometry.views import concat_cameras, even_views, resize_cameras, subset
-from gsmerge.measure.sizes import resize_photo
-from gsmerge.measure.visibility import context_points, visible_pixels
 from gsmerge.raster import composite, make_splats, tile_view
 from gsmerge.raster.photos import NEAR_PLANE, Photos, photos_of
 from gsmerge.runtime.threads import parallel_map
+from gsmerge.scoring.sizes import resize_photo
+from gsmerge.scoring.visibility import context_points, visible_pixels
 from gsmerge.types import Cameras, Scene, Views
 
 

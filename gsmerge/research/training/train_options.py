@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from gsmerge.measure.lpips import require_lpips
 from gsmerge.networks.options import SLOTS, NetworkOptions
 from gsmerge.research.training.loss_ssim import LOSS_WINDOW
+from gsmerge.scoring.lpips import require_lpips
 from gsmerge.settings.setting import Settings, setting
 from gsmerge.settings.stages import SEGMENTATIONS, MatchMethod, MatchOptions
 

@@ -8,7 +8,7 @@ import pytest
 
 from gsmerge.compaction import report
 from gsmerge.compaction.report import CompactReport, Covered, NewViews
-from gsmerge.measure.documents import to_json
+from gsmerge.runtime.documents import to_json
 from gsmerge.settings.compact import CompactOptions
 
 

@@ -12,9 +12,9 @@ from gsmerge import Gaussians, Scene, compact, render
 from gsmerge.compaction.left_out import choose_left_out, leave_out, mark_seen, mean_seen
 from gsmerge.compaction.new_views import OWN_WEIGHT, SPREAD, Trial, shrink_scene
 from gsmerge.compaction.report import NewViews
+from gsmerge.drawing.pages.page import describe_gain
 from gsmerge.geometry.views import subset
 from gsmerge.io.formats.rows import ExpectedScores, copied_comments, new_views_comment, read_expected_scores
-from gsmerge.pages.page import describe_gain
 from gsmerge.prepare.prepare_scene import LEAST_VIEWS, prepare
 from gsmerge.settings.stages import PrepareOptions
 from gsmerge.types import PicturedScene

@@ -15,8 +15,8 @@ from gsmerge import CompactOptions, compact, read_scene
 from gsmerge.compaction.estimate import estimate
 from gsmerge.inspection.inspect import inspect, inspection_lines
 from gsmerge.io import read_ply, write_ply
-from gsmerge.measure.coverage import extents
 from gsmerge.prepare.prepare_scene import views_notes
+from gsmerge.scoring.coverage import extents
 
 
 def test_inspecting_a_scene_that_fits_reports_its_facts(tiny_folder: Path, tiny: Tiny) -> None:

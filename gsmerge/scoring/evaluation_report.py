@@ -6,11 +6,11 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, fields
 from typing import Any
 
-from gsmerge.measure.documents import csv_text, document_head, note_entries, text_table, wrap_line
-from gsmerge.measure.evaluate import Evaluation, Quality, QualityPair, ResultScores
-from gsmerge.measure.fog import ALL, Fog
 from gsmerge.raster.photos import WHOLE_SHARE
+from gsmerge.runtime.documents import csv_text, document_head, note_entries, text_table, wrap_line
 from gsmerge.runtime.memory import human_bytes, human_share
+from gsmerge.scoring.evaluate import Evaluation, Quality, QualityPair, ResultScores
+from gsmerge.scoring.fog import ALL, Fog
 
 Row = Sequence[str]
 TextTable = tuple[str, Row, Sequence[Row]]  # heading, columns, rows

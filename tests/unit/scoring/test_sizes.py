@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scenes
 
-from gsmerge.measure.sizes import fill_cameras, fill_photo, resize_mask, resize_photo, shrink_cameras, shrink_views
+from gsmerge.scoring.sizes import fill_cameras, fill_photo, resize_mask, resize_photo, shrink_cameras, shrink_views
 from gsmerge.types import Views
 
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gsmerge.pages.data import PageView, ViewData
+from gsmerge.drawing.pages.data import PageView, ViewData
 from gsmerge.prepare.row_colors import PHOTOS, ROW_COLORS
 from gsmerge.runtime.memory import human_bytes, human_share
 from gsmerge.types import Cameras
@@ -327,7 +327,7 @@ def _environment() -> jinja2.Environment:
     """Make the environment of all templates."""
     import jinja2
 
-    loader = jinja2.PackageLoader("gsmerge.pages")
+    loader = jinja2.PackageLoader("gsmerge.drawing.pages")
     environment = jinja2.Environment(
         loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from gsmerge.measure.documents import text_table
+from gsmerge.runtime.documents import text_table
 from gsmerge.runtime.memory import human_bytes, human_share
 
 

@@ -15,10 +15,10 @@ import pytest
 from messages import refuses
 from PIL import Image
 
+from gsmerge.drawing import clip
+from gsmerge.drawing.preview import BytePicture
 from gsmerge.errors import SceneError
 from gsmerge.io.image_names import is_clip
-from gsmerge.measure import clip
-from gsmerge.measure.preview import BytePicture
 
 
 def draw_frames(count: int, height: int = 48, width: int = 64) -> Iterator[BytePicture]:

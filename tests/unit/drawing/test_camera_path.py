@@ -11,9 +11,7 @@ import pytest
 from messages import refuses
 from sweeps import sweep
 
-from gsmerge.geometry.transforms import camera_centres, motion_matrices, project
-from gsmerge.kernels import elementary
-from gsmerge.measure.camera_path import (
+from gsmerge.drawing.camera_path import (
     HORIZONTAL,
     VERTICAL,
     CameraPath,
@@ -25,7 +23,9 @@ from gsmerge.measure.camera_path import (
     spline,
     viewing_depth,
 )
-from gsmerge.measure.fog import fog_cameras
+from gsmerge.geometry.transforms import camera_centres, motion_matrices, project
+from gsmerge.kernels import elementary
+from gsmerge.scoring.fog import fog_cameras
 from gsmerge.types import Cameras
 
 DEPTH = 3.0

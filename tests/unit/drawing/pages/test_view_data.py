@@ -16,18 +16,18 @@ import scenes
 from messages import noted
 
 from gsmerge import Gaussians, Scene, evaluate, render
+from gsmerge.drawing.camera_path import outside_camera
+from gsmerge.drawing.pages import data, splats
+from gsmerge.drawing.pages.data import ViewData, collect_page_data, encode_still, short_names
+from gsmerge.drawing.pages.page import headline
+from gsmerge.drawing.pages.splats import pack_splats
+from gsmerge.drawing.preview import to_picture
 from gsmerge.geometry.frame import scene_frame
 from gsmerge.io.formats.spz import UNIX, spz_bytes
-from gsmerge.measure.camera_path import outside_camera
-from gsmerge.measure.evaluate import EvaluateOptions, near_plane
-from gsmerge.measure.lpips import lpips_available
-from gsmerge.measure.preview import to_picture
-from gsmerge.pages import data, splats
-from gsmerge.pages.data import ViewData, collect_page_data, encode_still, short_names
-from gsmerge.pages.page import headline
-from gsmerge.pages.splats import pack_splats
 from gsmerge.prepare.row_colors import ROW_COLORS
 from gsmerge.raster.metrics import psnr
+from gsmerge.scoring.evaluate import EvaluateOptions, near_plane
+from gsmerge.scoring.lpips import lpips_available
 from gsmerge.types import Views
 
 

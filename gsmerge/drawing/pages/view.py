@@ -11,14 +11,14 @@ from pathlib import Path
 from tempfile import mkdtemp
 from typing import Any
 
+from gsmerge.drawing.pages.data import collect_page_data
+from gsmerge.drawing.pages.page import headline, view_page
 from gsmerge.errors import UsageError
 from gsmerge.io.atomic import atomic_output
 from gsmerge.io.first_bytes import may_be_replaced
 from gsmerge.io.formats.ply import file_bytes
 from gsmerge.io.formats.read_gaussians import GaussianFile, read_gaussians
 from gsmerge.io.formats.rows import read_expected_scores
-from gsmerge.pages.data import collect_page_data
-from gsmerge.pages.page import headline, view_page
 from gsmerge.prepare.place_cameras import add_views
 from gsmerge.reading.input import as_scene
 from gsmerge.reading.scene_files import find_scene_files, scene_title

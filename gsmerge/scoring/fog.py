@@ -18,10 +18,10 @@ import numpy as np
 from gsmerge.fit.report import HAZE
 from gsmerge.geometry.transforms import camera_depths, middle_depth, step_outside
 from gsmerge.geometry.views import pick_views
-from gsmerge.measure.sizes import shrink_cameras
 from gsmerge.raster import Splats, make_splats, render, tile_view
 from gsmerge.raster.composite import blend_depths
 from gsmerge.runtime.record import Progress
+from gsmerge.scoring.sizes import shrink_cameras
 from gsmerge.types import Cameras, Gaussians
 
 VIEWS = 3  # evenly spread input views from which the cameras start

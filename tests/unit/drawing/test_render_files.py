@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 from messages import refuses
 
+from gsmerge.drawing.render_files import find_view
 from gsmerge.errors import UsageError
-from gsmerge.measure.drawings import find_view
 
 NAMES = ["images/00005.jpg", "images/00006.jpg", "images/00060.jpg", "a/0.png", "view 7"]
 

@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gsmerge.drawing.camera_path import outside_camera
 from gsmerge.errors import SceneError
 from gsmerge.io import atomic_output
-from gsmerge.measure.camera_path import outside_camera
 from gsmerge.raster import render
 from gsmerge.raster.metrics import psnr, psnr_words
 from gsmerge.types import Cameras, Gaussians

@@ -18,11 +18,11 @@ import cv2
 import numpy as np
 from PIL import Image
 
+from gsmerge.drawing.preview import FACE, BytePicture, shorten_text
 from gsmerge.errors import SceneError
 from gsmerge.io import atomic_output
 from gsmerge.io.image_names import CLIP_ENDS
 from gsmerge.kernels.elementary import sin
-from gsmerge.measure.preview import FACE, BytePicture, shorten_text
 from gsmerge.settings.pictures import GIF
 from gsmerge.types import StrPath
 

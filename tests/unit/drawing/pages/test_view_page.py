@@ -14,9 +14,9 @@ import pytest
 import scenes
 from page_policy import check_policy
 
-from gsmerge.measure.evaluate import Quality
-from gsmerge.pages.data import ViewData, collect_page_data
-from gsmerge.pages.page import headline, results_table, speed, speed_words, view_page
+from gsmerge.drawing.pages.data import ViewData, collect_page_data
+from gsmerge.drawing.pages.page import headline, results_table, speed, speed_words, view_page
+from gsmerge.scoring.evaluate import Quality
 
 EVIL = '</script><b onload="x">&{{ 7 * 7 }}'
 WEBP, PNG = "data:image/webp;base64,", "data:image/png;base64,"
@@ -263,7 +263,7 @@ def test_unpaired_surrogates_in_names_become_question_marks(data: ViewData) -> N
 
 def test_page_has_the_vendored_renderer() -> None:
     """Who changes it runs tools/vendor_viewer.py, which writes down where it came from."""
-    vendor = files("gsmerge.pages").joinpath("vendor")
+    vendor = files("gsmerge.drawing.pages").joinpath("vendor")
     sources = json.loads(vendor.joinpath("SOURCES.json").read_text())
     script = gzip.decompress(vendor.joinpath(sources["script"]["file"]).read_bytes())
     assert hashlib.sha256(script).hexdigest() == sources["script"]["sha256"]

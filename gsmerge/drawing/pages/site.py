@@ -6,16 +6,16 @@ from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
 
+from gsmerge.drawing.camera_path import median_camera
+from gsmerge.drawing.pages.data import encode_still
+from gsmerge.drawing.pages.page import VIEWER, base64_text, data_uri, describe_gain, page_camera, render_template
+from gsmerge.drawing.preview import to_picture
 from gsmerge.geometry.transforms import middle_depth
 from gsmerge.geometry.views import even_views
 from gsmerge.io.atomic import AddOutput
 from gsmerge.io.formats.rows import read_expected_scores
 from gsmerge.io.formats.sog import sog_bytes
 from gsmerge.io.formats.table import Contents
-from gsmerge.measure.camera_path import median_camera
-from gsmerge.measure.preview import to_picture
-from gsmerge.pages.data import encode_still
-from gsmerge.pages.page import VIEWER, base64_text, data_uri, describe_gain, page_camera, render_template
 from gsmerge.prepare.place_cameras import place_viewpoints
 from gsmerge.raster import render
 from gsmerge.types import Cameras, Gaussians
@@ -54,7 +54,7 @@ def measure(gaussians: Gaussians, cameras: Cameras, comments: Sequence[str]) -> 
 
 def _read_licences() -> bytes:
     """Join the licences of the viewer's parts to one text."""
-    vendor = resources.files("gsmerge.pages").joinpath("vendor")
+    vendor = resources.files("gsmerge.drawing.pages").joinpath("vendor")
     texts = [f"{name}\n\n{vendor.joinpath(f'LICENSE.{name}').read_text('utf-8')}" for name in LICENSED]
     return "\n\n".join(texts).encode()
 

@@ -17,12 +17,12 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 import gsmerge
 from gsmerge.cli.console import say_notes
-from gsmerge.measure.documents import to_json
-from gsmerge.measure.evaluate import INPUT, EvaluateOptions, Evaluation, evaluate, near_plane
-from gsmerge.measure.fog import measure_fog
-from gsmerge.measure.scores import CSV_COLUMNS, evaluation_csv, evaluation_document, evaluation_lines
 from gsmerge.prepare.row_colors import ROW_COLORS
 from gsmerge.raster.photos import scene_pictures
+from gsmerge.runtime.documents import to_json
+from gsmerge.scoring.evaluate import INPUT, EvaluateOptions, Evaluation, evaluate, near_plane
+from gsmerge.scoring.evaluation_report import CSV_COLUMNS, evaluation_csv, evaluation_document, evaluation_lines
+from gsmerge.scoring.fog import measure_fog
 from gsmerge.types import Gaussians, Scene, Views
 
 PLAIN = EvaluateOptions(lpips=())
@@ -345,7 +345,7 @@ def test_pictures_too_small_for_ssim_have_none() -> None:
 
 def test_pictures_too_small_for_lpips_have_none(monkeypatch: pytest.MonkeyPatch) -> None:
     looked = []
-    monkeypatch.setattr("gsmerge.measure.lpips.lpips", lambda image, photo, net, mask: float(looked.append(net) or 0.5))
+    monkeypatch.setattr("gsmerge.scoring.lpips.lpips", lambda image, photo, net, mask: float(looked.append(net) or 0.5))
     scene = scenes.make_scene(scenes.wall(), scenes.arc(1, 32, 24))
     score = evaluate(scene, {}, None, EvaluateOptions(("vgg", "alex"))).results[0].scores[0]
     assert (score.full.lpips_vgg, score.full.lpips_alex) == (0.5, None)

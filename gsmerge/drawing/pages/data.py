@@ -8,22 +8,22 @@ from pathlib import PurePosixPath
 
 import numpy as np
 
+from gsmerge.drawing.camera_path import outside_camera
+from gsmerge.drawing.pages.splats import MAX_GAUSSIANS, highest_degree, pack_splats
+from gsmerge.drawing.preview import OUTSIDE_VIEW, BytePicture, to_picture
 from gsmerge.geometry.frame import Frame, scene_frame
 from gsmerge.geometry.transforms import middle_depth
 from gsmerge.geometry.views import even_views
 from gsmerge.io.encode_pictures import encode_picture
 from gsmerge.io.photo_files import photo_array
-from gsmerge.measure.camera_path import outside_camera
-from gsmerge.measure.evaluate import INPUT, EvaluateOptions, Evaluation, Quality, ResultScores, evaluate
-from gsmerge.measure.lpips import lpips_available
-from gsmerge.measure.preview import OUTSIDE_VIEW, BytePicture, to_picture
-from gsmerge.pages.splats import MAX_GAUSSIANS, highest_degree, pack_splats
 from gsmerge.prepare.confirm_depths import Agreement, confirm_depths
 from gsmerge.raster import render
 from gsmerge.raster.metrics import is_worse
 from gsmerge.raster.photos import NEAR_PLANE, WHOLE_SHARE
 from gsmerge.runtime.record import Progress
 from gsmerge.runtime.threads import use_threads
+from gsmerge.scoring.evaluate import INPUT, EvaluateOptions, Evaluation, Quality, ResultScores, evaluate
+from gsmerge.scoring.lpips import lpips_available
 from gsmerge.types import Cameras, Gaussians, Scene, Views
 
 LPIPS = "alex"  # network of LPIPS, if its weights are installed; it takes 0.05 s per picture, "vgg" 0.8 s

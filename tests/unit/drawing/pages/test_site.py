@@ -16,9 +16,9 @@ import scenes
 from page_policy import check_policy
 
 from gsmerge.cli.paths import output_file
+from gsmerge.drawing.pages.site import MAX_VIEWPOINTS, NAMES, make_page
 from gsmerge.io import read_gaussians
 from gsmerge.io.first_bytes import may_be_replaced
-from gsmerge.pages.site import MAX_VIEWPOINTS, NAMES, make_page
 from gsmerge.types import Cameras
 
 EVIL = '</script><b onload="x">&{{ 7 * 7 }}'

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from sweeps import sweep
 
 from gsmerge.errors import GsmergeError, SceneError
-from gsmerge.measure import lpips as perceptual
-from gsmerge.measure.lpips import lpips, lpips_available
+from gsmerge.scoring import lpips as perceptual
+from gsmerge.scoring.lpips import lpips, lpips_available
 
 torch = pytest.importorskip("torch", reason="torch is not installed")
 max_pool2d = torch.nn.functional.max_pool2d

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from gsmerge.measure.visibility import VISIBILITY_GAUSSIANS, inside_views
 from gsmerge.raster.photos import LEAST_OPACITY
+from gsmerge.scoring.visibility import VISIBILITY_GAUSSIANS, inside_views
 from gsmerge.stages.clean import BOX_QUANTILES, beyond_scene, floater_share
 from gsmerge.types import Gaussians, Scene
 

@@ -14,9 +14,6 @@ from gsmerge.arrays import ArrayFields, as_pictures
 from gsmerge.errors import Doubt, UsageError, list_doubts
 from gsmerge.geometry.frame import scene_frame
 from gsmerge.geometry.views import pick_views
-from gsmerge.measure.fog import ALL, Fog, describe_fog, measure_fog
-from gsmerge.measure.sizes import resize_mask, shrink_cameras, shrink_views
-from gsmerge.measure.visibility import context_points, visible_pixels
 from gsmerge.prepare.prepare_scene import scored_pictures
 from gsmerge.prepare.row_colors import OWN_PHOTOS, PHOTOS, RENDERS, ROW_COLORS
 from gsmerge.raster import render
@@ -26,6 +23,9 @@ from gsmerge.reading.input import check_scene
 from gsmerge.runtime.arguments import check_arguments
 from gsmerge.runtime.record import Progress
 from gsmerge.runtime.threads import use_threads
+from gsmerge.scoring.fog import ALL, Fog, describe_fog, measure_fog
+from gsmerge.scoring.sizes import resize_mask, shrink_cameras, shrink_views
+from gsmerge.scoring.visibility import context_points, visible_pixels
 from gsmerge.settings.evaluate import EvaluateOptions
 from gsmerge.types import Cameras, Gaussians, HasGaussians, Scene, Views, own_gaussians
 
@@ -276,7 +276,7 @@ def evaluate(
 
 def _without_missing(options: EvaluateOptions) -> tuple[EvaluateOptions, tuple[str, ...]]:
     """Return the options without LPIPS networks that are not installed, and a note if none is installed."""
-    from gsmerge.measure.lpips import INSTALL, lpips_available
+    from gsmerge.scoring.lpips import INSTALL, lpips_available
 
     nets = tuple(net for net in options.lpips if lpips_available(net))
     note = f"LPIPS is left out, since its weights are not installed: {INSTALL}"
@@ -432,7 +432,7 @@ def _add_lpips(
     """Add LPIPS to the qualities over all pixels, and over the pixels that the input views have seen."""
     if not nets:
         return pair
-    from gsmerge.measure.lpips import lpips, min_size
+    from gsmerge.scoring.lpips import lpips, min_size
 
     fitting = [net for net in nets if min(image.shape[:2]) >= min_size(net)]
 

@@ -7,8 +7,8 @@ import pytest
 import scenes
 
 from gsmerge.geometry.views import resize_cameras, subset
-from gsmerge.measure import visibility
-from gsmerge.measure.visibility import context_points, visible_pixels
+from gsmerge.scoring import visibility
+from gsmerge.scoring.visibility import context_points, visible_pixels
 from gsmerge.types import Cameras, Scene
 
 

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gsmerge.drawing import preview
 from gsmerge.errors import SceneError
-from gsmerge.measure import preview
 from gsmerge.types import Cameras, Gaussians
 
 

@@ -8,15 +8,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from gsmerge.errors import SceneError, UsageError, name_notes
-from gsmerge.geometry.views import pick_views, subset
-from gsmerge.io import file_notes, read_cameras, read_gaussians, to_cameras
-from gsmerge.io.atomic import atomic_outputs, common_mode
-from gsmerge.io.cameras.camera_file import sizes_of
-from gsmerge.io.cameras.read_cameras import read_sharp_camera
-from gsmerge.io.image_names import IMAGE_SUFFIXES
-from gsmerge.measure.camera_path import parse_camera_path, sample_path, viewing_depth
-from gsmerge.measure.clip import (
+from gsmerge.drawing.camera_path import parse_camera_path, sample_path, viewing_depth
+from gsmerge.drawing.clip import (
     FOLDER_HINT,
     H264,
     MAX_GIF_PIXELS,
@@ -27,7 +20,7 @@ from gsmerge.measure.clip import (
     swipe_borders,
     write_clip,
 )
-from gsmerge.measure.preview import (
+from gsmerge.drawing.preview import (
     BytePicture,
     contact_sheet,
     outside_pictures,
@@ -35,7 +28,13 @@ from gsmerge.measure.preview import (
     to_picture,
     view_pictures,
 )
-from gsmerge.measure.sizes import fill_cameras, fill_photo, shrink_cameras
+from gsmerge.errors import SceneError, UsageError, name_notes
+from gsmerge.geometry.views import pick_views, subset
+from gsmerge.io import file_notes, read_cameras, read_gaussians, to_cameras
+from gsmerge.io.atomic import atomic_outputs, common_mode
+from gsmerge.io.cameras.camera_file import sizes_of
+from gsmerge.io.cameras.read_cameras import read_sharp_camera
+from gsmerge.io.image_names import IMAGE_SUFFIXES
 from gsmerge.prepare.place_cameras import add_views
 from gsmerge.raster import render_in_batches
 from gsmerge.raster.photos import NEAR_PLANE
@@ -46,6 +45,7 @@ from gsmerge.reading.scene_files import SceneFiles, find_scene_files
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.record import Progress, record_run
 from gsmerge.runtime.threads import use_threads
+from gsmerge.scoring.sizes import fill_cameras, fill_photo, shrink_cameras
 from gsmerge.settings.pictures import CLIPS, GIF, PICTURES
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.types import Cameras, Gaussians, StrPath
@@ -68,7 +68,7 @@ class DrawOptions:
     opacity: OpacityChoice = "auto"
     hints: ReadHints = NO_HINTS
     views: int | str | None = None  # largest number of views, or the name of one view; None: all, but four in a panel
-    path: str | None = None  # text of gsmerge.measure.camera_path.parse_camera_path, or a file of cameras
+    path: str | None = None  # text of gsmerge.drawing.camera_path.parse_camera_path, or a file of cameras
     frames: int | None = None  # frames of a path; None: enough for SECONDS; for a spline also VIEW_FRAMES per view
     size: tuple[int, int] | None = None  # width and height of a picture; None: the size of the cameras
     background: float = 0.0  # grey level in [0, 1]
@@ -124,7 +124,7 @@ class DrawnScenes:
     ) -> Iterator[tuple[BytePicture, ...]]:
         """Yield, for each camera, the 8-bit pictures of all scenes, with one view per thread in memory.
 
-        ``borders`` are the borders in each picture, see :func:`gsmerge.measure.clip.swipe_borders`. Scene i is shown
+        ``borders`` are the borders in each picture, see :func:`gsmerge.drawing.clip.swipe_borders`. Scene i is shown
         between the borders i and i + 1. Other columns of its picture need not be drawn, and may show the background
         only.
         """

@@ -14,7 +14,7 @@ from gsmerge.fit.outside import PLACES, STEP_BACK_HIGH, STEP_BACK_LOW
 from gsmerge.fit.outside import outside_cameras as place_views
 from gsmerge.geometry.transforms import camera_centres
 from gsmerge.kernels import elementary
-from gsmerge.measure.fog import (
+from gsmerge.scoring.fog import (
     ALL,
     FOG_CAMERAS,
     HAZE,

@@ -1,1 +1,0 @@
-"""Measure quality, size and speed, and draw pictures for people."""

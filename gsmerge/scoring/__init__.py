@@ -1,0 +1,1 @@
+"""What results are worth: evaluation against photos, fog, LPIPS, coverage and visibility."""
