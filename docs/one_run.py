@@ -38,7 +38,7 @@ ROW = (VIEW * HEIGHT + Y) * WIDTH + X  # row of this pixel's Gaussian
 LINE = 120  # most characters of a line of the page
 WATCHED = {  # functions that are recorded, by the module that calls them
     "gsmerge.reading.read_scene": ("align",),
-    "gsmerge.compaction.compact": ("make_plan", "build", "make_result"),
+    "gsmerge.road": ("make_plan", "build", "make_result"),
     "gsmerge.pipeline": ("segment_scene", "correct", "match", "merge", "decode_merged", "fit_scene"),
 }
 ZOOM, STRIP, GAP = 4, 22, 6  # enlargement of photos, height of a title, and gap between panels, pixels
@@ -420,8 +420,8 @@ def result_section(run: Run) -> str:
     return "\n\n".join([
         "## 5. make_result: what comes out",
         text(
-            "[`compaction/candidate.py`](../../gsmerge/compaction/candidate.py) moves the Gaussians into the world of",
-            "the file and scores them; [`compaction/result.py`](../../gsmerge/compaction/result.py) scores the input.",
+            "[`results/candidate.py`](../../gsmerge/results/candidate.py) moves the Gaussians into the world of",
+            "the file and scores them; [`results/result.py`](../../gsmerge/results/result.py) scores the input.",
         ),
         "\n".join([
             entry("result.gaussians.means", gaussians.means, child),

@@ -18,15 +18,10 @@ from gsmerge.version import __version__
 
 if TYPE_CHECKING:
     from gsmerge import integrations as integrations
-    from gsmerge.compaction.compact import compact as compact
-    from gsmerge.compaction.report import CompactReport as CompactReport
-    from gsmerge.compaction.result import CompactResult as CompactResult
-    from gsmerge.compaction.tensors import compact_tensors as compact_tensors
     from gsmerge.drawing.pages.view import view as view
     from gsmerge.errors import DoubtWarning as DoubtWarning
     from gsmerge.errors import GsmergeError as GsmergeError
     from gsmerge.errors import SceneError as SceneError
-    from gsmerge.inspection.inspect import inspect as inspect
     from gsmerge.io import read_cameras as read_cameras
     from gsmerge.io import read_gaussians as read_gaussians
     from gsmerge.io import read_ply as read_ply
@@ -34,34 +29,39 @@ if TYPE_CHECKING:
     from gsmerge.io import write_gaussians as write_gaussians
     from gsmerge.io import write_ply as write_ply
     from gsmerge.io.formats.streamed import write_levels as write_levels
+    from gsmerge.jobs.inspect import inspect as inspect
+    from gsmerge.jobs.states.compactor import Compactor as Compactor
+    from gsmerge.jobs.tensors import compact_tensors as compact_tensors
     from gsmerge.raster import Rendering as Rendering
     from gsmerge.raster import render as render
     from gsmerge.reading.read_scene import read_scene as read_scene
+    from gsmerge.results.report import CompactReport as CompactReport
+    from gsmerge.results.result import CompactResult as CompactResult
+    from gsmerge.road import compact as compact
     from gsmerge.scoring.evaluate import Evaluation as Evaluation
     from gsmerge.scoring.evaluate import evaluate as evaluate
     from gsmerge.settings.compact import CompactOptions as CompactOptions
     from gsmerge.settings.evaluate import EvaluateOptions as EvaluateOptions
     from gsmerge.stages.superpixels import saliency as saliency
     from gsmerge.stages.superpixels import superpixels as superpixels
-    from gsmerge.states.compactor import Compactor as Compactor
     from gsmerge.types import Cameras as Cameras
     from gsmerge.types import Gaussians as Gaussians
     from gsmerge.types import Scene as Scene
     from gsmerge.types import Views as Views
 
 _PUBLIC = {
-    "compaction.compact": ("compact",),
-    "inspection.inspect": ("inspect",),
-    "compaction.report": ("CompactReport",),
-    "compaction.result": ("CompactResult",),
-    "compaction.tensors": ("compact_tensors",),
+    "road": ("compact",),
+    "jobs.inspect": ("inspect",),
+    "results.report": ("CompactReport",),
+    "results.result": ("CompactResult",),
+    "jobs.tensors": ("compact_tensors",),
     "errors": ("DoubtWarning", "GsmergeError", "SceneError"),
     "io": ("read_cameras", "read_gaussians", "read_ply", "to_cameras"),
     "io.formats.streamed": ("write_levels",),
     "io.formats.write": ("write_gaussians", "write_ply"),
     "scoring.evaluate": ("Evaluation", "evaluate"),
     "drawing.pages.view": ("view",),
-    "states.compactor": ("Compactor",),
+    "jobs.states.compactor": ("Compactor",),
     "raster": ("Rendering", "render"),
     "reading.read_scene": ("read_scene",),
     "settings.compact": ("CompactOptions",),

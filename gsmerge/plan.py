@@ -22,7 +22,7 @@ from gsmerge.prepare.prepare_scene import Prepared
 from gsmerge.prepare.row_colors import RENDERS
 from gsmerge.prepare.scene_size import SceneSize
 from gsmerge.raster.photos import scored_tiles
-from gsmerge.runtime.record import note, stage
+from gsmerge.runtime.record import RunPart, note, stage
 from gsmerge.settings.budget import AUTO
 from gsmerge.settings.compact import CHECKPOINTS, OURS, CompactOptions
 from gsmerge.settings.fit import GROW_ROUNDS, GROW_STEPS, STEPS, USUAL_SHARE, FitOptions
@@ -50,6 +50,11 @@ NO_FIT = "without cameras a draft has no fit: --effort fast has one"
 BLOCK_GAUSSIANS = 8_000_000  # Gaussians of a block's own views, if the number of blocks is automatic
 WHOLE_GAUSSIANS = 20_000_000  # Gaussians up to which a scene is compacted in one piece, unless it has many views
 BLOCK_VIEWS, WHOLE_VIEWS = 42, 168  # the two limits above as numbers of views, if blocks see little of each other
+# Number of candidates that a search usually builds: first, if photos score them; second, if renders of the input do
+USUAL_BUILDS, USUAL_BUILDS_OF_RENDERS = 3, 1
+# Work of the stages of a build, and of scoring the input, for each view, in steps of a fit
+STAGE_STEPS, INPUT_STEPS = 10.0, 3.0
+TRIAL_SHARE = 0.25  # cost of the trial that estimates new views, as a share of building the result
 LONE_K = 4  # K if all views have the same camera, because no other view adds Gaussians to a surface
 
 
@@ -533,3 +538,18 @@ def own_views(prepared: Prepared) -> tuple[int, ...]:
     if not prepared.reference.of_views:
         return prepared.reference.score_views
     return tuple(view for view, place in enumerate(prepared.repeated) if place in prepared.reference.score_views)
+
+
+def usual_builds(*, has_target: bool, rendered: bool) -> int:
+    """Return how many results a run usually builds; ``rendered``: renders of the input stand for photos."""
+    return (USUAL_BUILDS_OF_RENDERS if rendered else USUAL_BUILDS) if has_target else 1
+
+
+def run_parts(prepared: Prepared, plan: Plan) -> list[RunPart]:
+    """Return the parts that a run in one piece is expected to have, in their order, after the fits of a curve."""
+    views, steps = len(prepared.scene), 0 if plan.fit.fit == "none" else plan.fit.steps
+    build = RunPart("build", STAGE_STEPS * views, steps)
+    count = usual_builds(has_target=plan.target_psnr is not None, rendered=prepared.reference.name == RENDERS)
+    trial = RunPart("trial", TRIAL_SHARE / 2 * build.stages, TRIAL_SHARE / 2 * steps)  # one of two rounds
+    parts = [build] * (count + plan.levels - 1)
+    return [*parts, RunPart("input", INPUT_STEPS * views), *([trial] * 2 if plan.new_views else [])]

@@ -18,7 +18,7 @@ from gsmerge.settings.setting import Setting
 from gsmerge.settings.stages import Engine
 
 if TYPE_CHECKING:
-    from gsmerge.batch import BatchOptions, Job
+    from gsmerge.jobs.batch import BatchOptions, Job
 
 JOBS = Setting("Number of scenes to run at the same time, or auto.", kind=int | Literal["auto"], least=1)
 MAX_LISTED = 20  # rows of the table, failures, and doubtful results
@@ -72,9 +72,9 @@ def batch(
         SETTINGS, set, budget=budget, quality=quality, levels=levels, k=k, effort=effort, fit=fit, crop=crop, drop=drop,
         engine=engine, seed=seed, threads=threads,
     )  # fmt: skip
-    from gsmerge.batch import BatchOptions, find_jobs
-    from gsmerge.batch.find import describe_lost
-    from gsmerge.batch.records import RecordIndex
+    from gsmerge.jobs.batch import BatchOptions, find_jobs
+    from gsmerge.jobs.batch.find import describe_lost
+    from gsmerge.jobs.batch.records import RecordIndex
 
     settings, ray = given.make(*SETTINGS)
     try:
@@ -102,7 +102,7 @@ def _run(
     strict: bool, json: bool, quiet: bool,
 ) -> None:  # fmt: skip
     """Compact all scenes, print a summary, and raise an error if some failed or missed their target."""
-    from gsmerge.batch.run import choose_concurrency
+    from gsmerge.jobs.batch.run import choose_concurrency
 
     totals, silent = Totals(len(jobs)), quiet or json
     say(f"{count_words(len(jobs), 'scene')}, {choose_concurrency(jobs, options)}", quiet=silent)
@@ -132,8 +132,8 @@ def _run_jobs(
     out: Path, jobs: "Sequence[Job]", options: "BatchOptions", totals: "Totals", *, as_json: bool, quiet: bool
 ) -> None:
     """Compact the scenes of all jobs, add each record to the totals, and print it with ``--json``."""
-    from gsmerge.batch import run_batch
-    from gsmerge.batch.records import FAILED, SKIPPED
+    from gsmerge.jobs.batch import run_batch
+    from gsmerge.jobs.batch.records import FAILED, SKIPPED
 
     stdout = sys.stdout
     with (
@@ -201,8 +201,8 @@ class Totals:
 
         The table is at most ``columns`` wide.
         """
-        from gsmerge.batch.records import DONE, FAILED, SKIPPED
         from gsmerge.io.image_names import natural_key
+        from gsmerge.jobs.batch.records import DONE, FAILED, SKIPPED
         from gsmerge.runtime.documents import text_table
         from gsmerge.runtime.memory import human_share
 
@@ -276,7 +276,7 @@ def _print_plan(
     out: Path, jobs: "Sequence[Job]", options: "BatchOptions", notes: Sequence[str], *, as_json: bool
 ) -> None:
     """Print which scenes a batch would compact, for ``--dry-run``; BatchError if some would fail."""
-    from gsmerge.batch.run import choose_concurrency, pending_jobs
+    from gsmerge.jobs.batch.run import choose_concurrency, pending_jobs
     from gsmerge.runtime.documents import document_head, note_entries
 
     pending = pending_jobs(jobs, out, options)

@@ -21,9 +21,9 @@ from gsmerge.settings.reading import NONE
 from gsmerge.settings.stages import Engine
 
 if TYPE_CHECKING:
-    from gsmerge.compaction.outputs import Outputs
     from gsmerge.reading.read_scene import Loaded
     from gsmerge.reading.scene_files import SceneFiles
+    from gsmerge.results.outputs import Outputs
 
 SETTINGS = (CompactOptions, FileOptions, Engine)
 REMEDY = "more Gaussians (--k, --budget) or a longer fit (--effort) show them better"
@@ -111,7 +111,7 @@ def _compact_files(
         from gsmerge.runtime.work import require_ray
 
         require_ray()
-    from gsmerge.compaction.outputs import name_outputs
+    from gsmerge.results.outputs import name_outputs
 
     outputs = name_outputs(run.out, writing, overwrite=run.overwrite)
     settings = _choose_levels(settings, outputs, has_levels=has_levels)
@@ -120,7 +120,7 @@ def _compact_files(
         print_estimate(files, settings, outputs, reading, as_json=run.json)
         return None
     _warn_of_memory(files, settings, quiet=run.silent)
-    from gsmerge.compaction.compact import compact_files
+    from gsmerge.road import compact_files
 
     loads: list[Loaded] = []
     seconds_before = {"import": perf_counter() - run.start}
@@ -185,7 +185,7 @@ def _check_outputs(files: "SceneFiles", settings: CompactOptions, outputs: "Outp
 
 def _print_result(document: Mapping[str, Any], run: Run) -> None:
     """Print the report of a run and, unless a page will show the result, how to view it."""
-    from gsmerge.compaction.report import result_table
+    from gsmerge.results.report import result_table
 
     notes = split_notes(document["notes"], "worse")[1]  # :func:`_judge_result` prints the others
     say_notes([note for note in notes if not (run.strict and isinstance(note, Doubt))], quiet=run.silent)
@@ -230,9 +230,9 @@ def _refuse_options(context: typer.Context, path: Path) -> None:
 
 def _decode_features(path: Path, given: opt.Given, run: Run) -> None:
     """Decode the Feature Gaussians of a ``.gsm``, and write the result."""
-    from gsmerge.compaction.outputs import name_outputs
+    from gsmerge.jobs.states.files import decode_file, decoding_line
+    from gsmerge.results.outputs import name_outputs
     from gsmerge.settings.stages import DecodeOptions
-    from gsmerge.states.files import decode_file, decoding_line
 
     decoding, writing = given.make(DecodeOptions, FileOptions, columns="needed")
     outputs = name_outputs(run.out, writing, overwrite=run.overwrite)
@@ -250,7 +250,7 @@ def _find_features(scenes: Sequence[Path]) -> Path | None:
     states = [path for path in scenes if path.suffix.lower() == STATE_ENDING and path.is_file()]
     if not states:
         return None
-    from gsmerge.states.state_file import holds_features
+    from gsmerge.jobs.states.state_file import holds_features
 
     path = next(filter(holds_features, states), None)
     if path is not None and len(scenes) > 1:
@@ -290,10 +290,10 @@ def _check_scenes(scenes: Sequence[Path], output: Path | None, cameras: Path | s
 
 def _warn_of_memory(files: "SceneFiles", settings: CompactOptions, *, quiet: bool) -> None:
     """Warn before reading if the scene, or the largest of its blocks, is not likely to fit into memory."""
-    from gsmerge.compaction.partition import gaussians_at_once
     from gsmerge.io.formats.table import estimate_counts
     from gsmerge.plan import wanted_blocks
     from gsmerge.runtime.memory import memory_bytes, memory_problem
+    from gsmerge.special.blocks.partition import gaussians_at_once
 
     count, num_rest = estimate_counts([ply for scene_files in (files, *files.more) for ply in scene_files.plys])
     at_once = gaussians_at_once(count, wanted_blocks(settings, count))
@@ -307,8 +307,8 @@ def print_estimate(
     files: "SceneFiles", settings: CompactOptions, outputs: "Outputs", reading: opt.Reading, *, as_json: bool
 ) -> None:
     """Print an estimate of the result that ``compact`` would make."""
-    from gsmerge.compaction.estimate import dry_run_lines, estimate_files
-    from gsmerge.compaction.files import read_input
+    from gsmerge.jobs.estimate import dry_run_lines, estimate_files
+    from gsmerge.reading.input import read_input
 
     load = read_input(files, opacity=reading.opacity, hints=reading.hints)
     with opt.usage_errors():

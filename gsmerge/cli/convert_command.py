@@ -44,12 +44,12 @@ def convert(
     inputs = [file for path in inputs for file in (find_plys(path) if path.is_dir() else [path])]
     writing, cleaning, placement = given.make(*SETTINGS)
     named = [path for path in (cameras, images) if isinstance(path, Path)]
-    from gsmerge.compaction.outputs import name_outputs
+    from gsmerge.results.outputs import name_outputs
 
     outputs = name_outputs(output_file(output, inputs[0].name), writing, overwrite=overwrite)
     check_outputs(outputs.paths, (*inputs, *named), overwrite=overwrite)
-    from gsmerge.compaction.convert import ConvertOptions, conversion_line, convert_files
     from gsmerge.io.formats.table import estimate_counts
+    from gsmerge.jobs.convert import ConvertOptions, conversion_line, convert_files
     from gsmerge.runtime.memory import conversion_bytes, memory_problem
     from gsmerge.runtime.record import record_run
 

@@ -34,7 +34,7 @@ def extend(
     reading = opt.read_hints(hint)
     if len(scenes) > 1 and {cameras, images} - {None, NONE}:
         raise UsageError("--cameras and --images: expected one batch with them, got several; add one batch at a time")
-    from gsmerge.states.files import batch_line, extend_file
+    from gsmerge.jobs.states.files import batch_line, extend_file
 
     given = opt.read_settings(SETTINGS, set, threads=threads)
     with given.usage_errors():

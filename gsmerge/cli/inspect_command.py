@@ -18,8 +18,8 @@ def inspect(
     quiet: opt.Quiet = False,
 ) -> None:  # fmt: skip
     """Check and describe files, and say what compact would make of each scene, or why compact refuses the scene."""
-    from gsmerge.inspection.file_checks import holds_scene
     from gsmerge.io.formats.table import INDEX
+    from gsmerge.jobs.file_checks import holds_scene
 
     path, reading = paths[0], opt.read_hints(hint)
     if len(paths) == 1 and (holds_scene(path) or path.name == INDEX):
@@ -34,10 +34,10 @@ def _inspect_scene(
     path: Path, cameras: str | None, images: str | None, reading: opt.Reading, *, json: bool, quiet: bool
 ) -> None:
     """Describe a scene in detail; SceneError if ``compact`` refuses the scene."""
-    from gsmerge.inspection.file_checks import check_content
-    from gsmerge.inspection.inspect import inspect as inspect_scene
-    from gsmerge.inspection.inspect import inspection_lines
     from gsmerge.io.formats.table import INDEX
+    from gsmerge.jobs.file_checks import check_content
+    from gsmerge.jobs.inspect import inspect as inspect_scene
+    from gsmerge.jobs.inspect import inspection_lines
     from gsmerge.runtime.documents import document_head
     from gsmerge.runtime.record import record_run
 
@@ -55,7 +55,7 @@ def _inspect_scene(
 
 def _print_checks(paths: Sequence[Path], reading: opt.Reading, *, json: bool, quiet: bool) -> None:
     """Print a line for each file; SceneError if ``compact`` refuses one."""
-    from gsmerge.inspection.file_checks import FileCheck, check_content
+    from gsmerge.jobs.file_checks import FileCheck, check_content
     from gsmerge.runtime.documents import document_head, note_entries
 
     checks, silent = list[FileCheck](), quiet or json

@@ -1,4 +1,4 @@
-"""Take the input of a run: check a scene in memory, or read one from a path."""
+"""Take the input of a run: check a scene in memory, read one from a path, or from files that must not change."""
 
 from __future__ import annotations
 
@@ -8,10 +8,19 @@ from dataclasses import replace
 import numpy as np
 
 from gsmerge.arrays import Array, as_array, check_numbers
-from gsmerge.errors import SceneError
+from gsmerge.errors import SceneError, split_notes
 from gsmerge.io.cameras.camera_file import check_camera
-from gsmerge.reading.read_scene import load_scene
+from gsmerge.io.formats.columns import list_names
+from gsmerge.io.formats.ply import is_from_gsmerge
+from gsmerge.io.formats.rows import RESULT_COMMENT
+from gsmerge.reading.content_hash import list_changed, read_stats
+from gsmerge.reading.exporters import NO_HINTS, ReadHints
+from gsmerge.reading.read_scene import Loaded, load_files, load_scene
+from gsmerge.reading.scene_files import SceneFiles, result_cameras
+from gsmerge.runtime.documents import file_sha256
+from gsmerge.runtime.memory import release_memory
 from gsmerge.runtime.record import note
+from gsmerge.settings.reading import OpacityChoice
 from gsmerge.types import Scene, StrPath
 
 TOLERANCE = 1e-3  # opacities and images may lie outside [0, 1] by this much
@@ -27,6 +36,46 @@ def as_scene(scene: Scene | StrPath) -> Scene:
     for text in scene.notes:
         note(text)
     return scene
+
+
+def read_input(
+    files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: ReadHints = NO_HINTS, hashed: bool = False
+) -> Loaded:
+    """Read a scene from its files, with notes on missing or unusual content.
+
+    If ``hashed``, the files of Gaussians are also hashed. Raises SceneError if the scene cannot be read, or if one of
+    its files changes while it is read.
+    """
+    stats = read_stats(files)
+    loaded = load_files(files, opacity=opacity, hints=hints)
+    # The scene already has the photos that were inside the camera file, so the copy in ``loaded`` is freed
+    cameras = None if loaded.cameras is None else replace(loaded.cameras, images=())
+    sha256 = file_sha256(*files.all_plys) if hashed else None
+    if changed := list_changed(stats):
+        raise SceneError(changed[0], "changed while it was read", "run this again when the file is complete")
+    release_memory()
+    return replace(loaded, cameras=cameras, stats=stats, sha256=sha256, notes=(*loaded.notes, *_compact_notes(loaded)))
+
+
+def _compact_notes(loaded: Loaded) -> list[str]:
+    """Return notes on columns that the result will lack, and on a scene that is a result already.
+
+    A file of gsmerge is recognised by its header or, in formats without one, by the cameras beside it. A file of
+    gsmerge is a result if its header says so, or if it has at most one Gaussian for every two pixels of its views.
+    """
+    scene, comments, notes = loaded.scene, loaded.info.comments, list[str]()
+    told = {name for note in split_notes(loaded.info.adapted, "columns")[0] for name in note.names}
+    lost = [name for name in loaded.info.extra_columns if name not in told]
+    if lost:
+        notes.append(f"merged Gaussians do not have the columns {list_names(lost)}; gsmerge convert copies them")
+    pixels = len(scene) * scene.cameras.height * scene.cameras.width
+    is_own = is_from_gsmerge(comments) or result_cameras(loaded.files.ply) is not None
+    is_small = is_own and scene.num_gaussians <= pixels / 2
+    if is_small or RESULT_COMMENT in comments:
+        count = f"{scene.num_gaussians:,} Gaussians for {pixels:,} pixels" if pixels else "no Gaussian per pixel"
+        remedy = "start from the original for more detail"
+        notes.append(f"the scene is compact already ({count}, written by gsmerge): {remedy}")
+    return notes
 
 
 def check_scene(scene: Scene) -> None:

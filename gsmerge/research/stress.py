@@ -16,11 +16,11 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from gsmerge.compaction.compact import compact
 from gsmerge.errors import GsmergeError, UsageError
 from gsmerge.geometry.frame import Frame, scene_frame
 from gsmerge.geometry.transforms import move_views
 from gsmerge.geometry.views import even_views, subset, take_rows
+from gsmerge.road import compact
 from gsmerge.runtime.record import Progress
 from gsmerge.scoring.evaluate import EvaluateOptions, evaluate
 from gsmerge.settings.budget import BudgetOptions

@@ -20,9 +20,9 @@ import typer.main
 
 import gsmerge
 from gsmerge.cli.app import app
-from gsmerge.compaction.report import report_document
 from gsmerge.drawing.pages.view import Page
 from gsmerge.io.formats.table import FORMATS
+from gsmerge.results.report import report_document
 from gsmerge.settings.compact import method_names
 from gsmerge.settings.placement import PlacementOptions
 from gsmerge.settings.setting import flat_settings
@@ -221,7 +221,7 @@ def test_every_option_is_a_field_of_the_api() -> None:
 
 
 def test_every_key_of_the_report_is_described() -> None:
-    """Keys that the program names of the JSON report, see :func:`gsmerge.compaction.report.report_document`."""
+    """Keys that the program names of the JSON report, see :func:`gsmerge.results.report.report_document`."""
     source = inspect.getsource(report_document)
     keys = set(re.findall(r'^ {8}"(\w+)":', source, re.MULTILINE)) | {f.name for f in fields(gsmerge.CompactReport)}
     text = read("docs/reference/report.md")

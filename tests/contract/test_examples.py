@@ -22,7 +22,7 @@ def test_examples_run_one_after_the_other(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Two fits, which take a second. What an example calls runs in this process, which is twice as fast."""
-    monkeypatch.setattr("gsmerge.batch.run.ProcessPool", InlinePool)
+    monkeypatch.setattr("gsmerge.jobs.batch.run.ProcessPool", InlinePool)
     monkeypatch.setattr("time.sleep", lambda _: None)
 
     def run_here(call: list[str], *, check: bool) -> subprocess.CompletedProcess[str]:

@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 import typer.main
 
-from gsmerge.batch import BatchOptions
 from gsmerge.cli import main
 from gsmerge.cli.app import app
+from gsmerge.jobs.batch import BatchOptions
 from gsmerge.research.generate import GenerateOptions
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.files import FileOptions

@@ -39,7 +39,7 @@ for words in {told!r}:
     assert main(words) == 0
 assert main(["compact", "room", "--magic"]) == 2
 loaded, kinds = [m for m in sys.modules if "." not in m], []
-import gsmerge.raster, gsmerge.inspection.inspect
+import gsmerge.raster, gsmerge.jobs.inspect
 kinds += [type(gsmerge.render).__name__, type(gsmerge.inspect).__name__]
 import gsmerge.pipeline
 kinds += [type(gsmerge.render).__name__, type(gsmerge.inspect).__name__]

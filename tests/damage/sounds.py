@@ -43,12 +43,12 @@ from gsmerge.io.cameras.read_cameras import read_sharp_camera
 from gsmerge.io.formats import tileset
 from gsmerge.io.formats.table import Contents
 from gsmerge.io.photo_files import decode_alpha, decode_levels
+from gsmerge.jobs.states.compactor import Compactor
+from gsmerge.jobs.states.state_file import load_state
 from gsmerge.kernels.matrices import invert
 from gsmerge.networks.checkpoint import load_checkpoint
 from gsmerge.reading.read_scene import load_scene
 from gsmerge.settings.compact import CompactOptions
-from gsmerge.states.compactor import Compactor
-from gsmerge.states.state_file import load_state
 from gsmerge.types import Gaussians
 
 from .changes import pack_members
@@ -200,7 +200,7 @@ def check_mask(path: Path) -> None:
 
 def check_list(path: Path) -> None:
     """List the scenes of a batch; a list may name no other folder here, so that none is searched."""
-    from gsmerge.batch.find import find_scenes
+    from gsmerge.jobs.batch.find import find_scenes
 
     if b"/" not in path.read_bytes() and b".." not in path.read_bytes():
         list(find_scenes([str(path)], path.parent / "out"))

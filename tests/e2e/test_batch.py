@@ -14,9 +14,9 @@ from messages import names
 from shared import make_once, write_scene
 
 import gsmerge
-from gsmerge.batch.records import record
 from gsmerge.cli import main
 from gsmerge.cli.batch_command import Totals
+from gsmerge.jobs.batch.records import record
 
 from .conftest import Outcome, Run, listing
 
@@ -49,7 +49,7 @@ def batch(run: Run, rooms: Path, out: Path, *options: object) -> Outcome:
 def _in_this_process() -> Iterator[None]:
     """Run batches in this process: those of ``test_batch_faults.py`` take seconds to start others."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("gsmerge.batch.run.ProcessPool", InlinePool)
+        patch.setattr("gsmerge.jobs.batch.run.ProcessPool", InlinePool)
         yield
 
 

@@ -16,9 +16,6 @@ from splat_transform_programs import put_stand_in, run_here
 from sweeps import sweep
 
 import gsmerge
-from gsmerge.compaction.convert import ConvertOptions, convert_files, join_gaussians
-from gsmerge.compaction.outputs import name_outputs
-from gsmerge.compaction.placement import find_placement, rotation_between
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.geometry.transforms import covariances
 from gsmerge.io.atomic import AddOutput
@@ -26,6 +23,8 @@ from gsmerge.io.cameras.viewer_cameras import viewer_cameras, viewer_cameras_pat
 from gsmerge.io.formats import table as formats
 from gsmerge.io.formats.streamed import read_index, read_level
 from gsmerge.io.formats.table import Contents, Format
+from gsmerge.jobs.convert import ConvertOptions, convert_files, find_placement, join_gaussians, rotation_between
+from gsmerge.results.outputs import name_outputs
 from gsmerge.settings.placement import AXES, PlacementOptions
 from gsmerge.settings.stages import CleanOptions
 from gsmerge.types import Gaussians

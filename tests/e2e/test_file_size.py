@@ -55,7 +55,7 @@ def test_budget_in_bytes_counts_harmonics(tmp_path: Path, small_scene: Path, run
 def test_states_and_batches_meet_a_budget_in_bytes(
     name: str, size: int, small_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gsmerge.batch.run.ProcessPool", InlinePool)
+    monkeypatch.setattr("gsmerge.jobs.batch.run.ProcessPool", InlinePool)
     many = ("--set", "superpixels=40%", "--set", "checkpoint=none", "-q")
     bare, filled = ("--fit", "none", "-q"), ("--set", "fill=true")
     run("extend", tmp_path / "a.gsm", small_scene, *many, code=0)

@@ -8,7 +8,7 @@ import pytest
 from messages import says
 
 import gsmerge
-from gsmerge.compaction import files
+from gsmerge.reading import input as files
 
 from .conftest import Run, assert_refused, listing
 

@@ -13,7 +13,7 @@ from shared import write_made
 from sweeps import sweep
 
 import gsmerge
-from gsmerge.compaction.result import CompactResult
+from gsmerge.results.result import CompactResult
 
 NUM_VIEWS = 5
 

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from messages import names
 
-import gsmerge.compaction.files as stage
-from gsmerge.compaction.compact import compact_files
-from gsmerge.compaction.outputs import Outputs
+import gsmerge.reading.input as stage
 from gsmerge.errors import SceneError
 from gsmerge.reading.scene_files import find_scene_files
+from gsmerge.results.outputs import Outputs
+from gsmerge.road import compact_files
 from gsmerge.runtime.documents import file_sha256
 from gsmerge.settings.compact import CompactOptions
 

@@ -18,7 +18,7 @@ from damage import SOUNDS, places
 from damage.random_changes import mutate
 from forked_commands import CommandServer, Limits, refused_by_inspect
 
-from gsmerge.inspection.file_checks import check_content
+from gsmerge.jobs.file_checks import check_content
 
 COUNT, MANY = 2, 20  # mutations of a kind
 FEWER = 10  # of kinds that take one or two seconds for each mutation: their rows have to be placed

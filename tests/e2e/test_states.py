@@ -21,10 +21,10 @@ from shared import make_once, write_scene
 import gsmerge
 from gsmerge.cli import main
 from gsmerge.io.cameras.read_cameras import read_cameras
+from gsmerge.jobs.states.extend import NOT_COMPARED
+from gsmerge.jobs.states.state_file import load_state, save_state
 from gsmerge.reading.read_scene import load_scene
 from gsmerge.reading.scene_files import find_scene_files
-from gsmerge.states.extend import NOT_COMPARED
-from gsmerge.states.state_file import load_state, save_state
 
 from .conftest import Run, assert_refused, listing
 
@@ -293,7 +293,7 @@ def test_batches_before_a_broken_one_stay_in_the_state(
 @pytest.mark.parametrize("exists", [False, True])
 def test_two_extensions_at_once_lose_no_batch(exists: bool, state: Path, walks: list[Path], tmp_path: Path) -> None:
     """The second waits for the first, and adds to what that one has made."""
-    from gsmerge.states.files import extend_file
+    from gsmerge.jobs.states.files import extend_file
 
     path = state if exists else tmp_path / "new.gsm"
     before = len(load_state(path).about["batches"]) if exists else 0

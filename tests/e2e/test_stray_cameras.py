@@ -22,7 +22,7 @@ FEW = ("--budget", "20%", "--fit", "none", "--effort", "draft", "--threads", 1)
 @pytest.fixture(autouse=True)
 def _in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """Run batches in this process: another takes a second to start."""
-    monkeypatch.setattr("gsmerge.batch.run.ProcessPool", InlinePool)
+    monkeypatch.setattr("gsmerge.jobs.batch.run.ProcessPool", InlinePool)
 
 
 @pytest.fixture

@@ -119,7 +119,7 @@ def test_cropped_result_is_not_called_worse(smallest_scene: Path) -> None:
 def test_a_batch_names_worse_results(
     smallest_scene: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gsmerge.batch.run.ProcessPool", InlinePool)
+    monkeypatch.setattr("gsmerge.jobs.batch.run.ProcessPool", InlinePool)
     out = tmp_path / "out"
     call = ("batch", smallest_scene, "-o", out, "--jobs", 1, *FEW)
     said = run(*call, code=0)

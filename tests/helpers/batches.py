@@ -12,9 +12,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from gsmerge.batch import BatchOptions, Job, find_jobs
-from gsmerge.batch.records import RECORDS
-from gsmerge.batch.run import Run, read_run_index
+from gsmerge.jobs.batch import BatchOptions, Job, find_jobs
+from gsmerge.jobs.batch.records import RECORDS
+from gsmerge.jobs.batch.run import Run, read_run_index
 from gsmerge.runtime.work import Call, WorkerPool
 from gsmerge.settings.compact import CompactOptions
 

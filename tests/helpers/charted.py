@@ -23,5 +23,5 @@ def _write(place: Path) -> None:
     scene = write_scene(place / "room", num_views=3, width=64, height=48)
     words = ("lab", "chart", scene, "-o", place / "out", *CHART_TARGETS, *CHART_FAST, "-q")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("gsmerge.batch.run.ProcessPool", InlinePool)
+        patch.setattr("gsmerge.jobs.batch.run.ProcessPool", InlinePool)
         assert main([str(word) for word in words]) == 0

@@ -17,8 +17,6 @@ import numpy as np
 from floors import nudged
 
 from gsmerge import Cameras, Gaussians, Scene, compact, render
-from gsmerge.compaction.report import CompactReport
-from gsmerge.compaction.result import CompactResult
 from gsmerge.fit import FitJob, FitOptions
 from gsmerge.fit.schedule import FitRun, prepare_fit
 from gsmerge.geometry.transforms import covariances, normalize, quat_to_rotmat, rotmat_to_quat
@@ -29,6 +27,8 @@ from gsmerge.raster.photos import Photos, scene_photos
 from gsmerge.research.generate import objects, photograph, shapes
 from gsmerge.research.generate.noise import Noise, TrueView, pixel_gaussians
 from gsmerge.research.generate.synthetic_scene import look_at as camera_to_world
+from gsmerge.results.report import CompactReport
+from gsmerge.results.result import CompactResult
 from gsmerge.types import SH_C0, FeatureGaussians, Pixels
 
 Texture = Callable[[np.ndarray], np.ndarray]

@@ -14,7 +14,7 @@ from messages import noted, refuses
 from sweeps import sweep
 
 from gsmerge import Gaussians, Scene, compact, render
-from gsmerge.compaction.result import CompactResult
+from gsmerge.results.result import CompactResult
 
 
 @pytest.fixture(scope="module")

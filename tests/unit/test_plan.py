@@ -14,13 +14,11 @@ from messages import noted
 from scenes import psnr_of
 
 from gsmerge import CompactOptions, Scene, compact
-from gsmerge.compaction.candidate import score
-from gsmerge.compaction.estimate import estimate
-from gsmerge.compaction.search import MAX_BUILDS, add_target
 from gsmerge.errors import UsageError
 from gsmerge.fit import Fitted
 from gsmerge.geometry.frame import canonicalise
 from gsmerge.geometry.views import REPORT_VIEWS
+from gsmerge.jobs.estimate import estimate
 from gsmerge.networks.checkpoint import IN_PACKAGE
 from gsmerge.plan import (
     EFFORTS,
@@ -36,9 +34,11 @@ from gsmerge.plan import (
 from gsmerge.prepare.confirm_depths import Agreement, confirm_depths
 from gsmerge.prepare.prepare_scene import prepare
 from gsmerge.prepare.scene_size import SceneSize, measure_size
+from gsmerge.results.candidate import score
 from gsmerge.runtime.record import record_run
 from gsmerge.settings.compact import EFFORT_NAMES as NAMES
 from gsmerge.settings.fit import GROW_STEPS
+from gsmerge.special.search import MAX_BUILDS, add_target
 
 
 @pytest.fixture(scope="module")
@@ -310,7 +310,7 @@ def test_the_estimate_is_what_the_run_does(
         plans.append(make_plan(*arguments, **run))
         return plans[-1]
 
-    monkeypatch.setattr("gsmerge.compaction.compact.make_plan", record_plan)
+    monkeypatch.setattr("gsmerge.road.make_plan", record_plan)
     options = options_of(**settings)
     size, agreement = measure_size(scene), confirm_depths(canonicalise(scene)[0])
     run, result, choices = (

@@ -11,11 +11,11 @@ import scenes
 import unaligned_scenes
 
 from gsmerge import Cameras, CompactOptions, Scene, compact, render
-from gsmerge.compaction.estimate import estimate
 from gsmerge.fit import Fitted
 from gsmerge.fit.outside import STEP_BACK_HIGH, STEP_BACK_LOW, outside_cameras
 from gsmerge.fit.report import FitReport
 from gsmerge.geometry.transforms import camera_centres
+from gsmerge.jobs.estimate import estimate
 from gsmerge.pipeline import build
 from gsmerge.plan import make_plan, plan_scene
 from gsmerge.prepare.place_cameras import (

@@ -2,8 +2,8 @@
 
 A ``.gsm`` is a safetensors file. Its only metadata entry is a header in JSON, with checksums of the header and of each
 array. Files of the kind ``scene`` hold results with their cameras and pictures. This module reads ``scene`` files.
-Files of the kind ``features`` hold Feature Gaussians, and are read by :mod:`gsmerge.states.features`. No content of a
-file is executed, and each array is checked before it is used.
+Files of the kind ``features`` hold Feature Gaussians, and are read by :mod:`gsmerge.jobs.states.features`. No content
+of a file is executed, and each array is checked before it is used.
 """
 
 from __future__ import annotations

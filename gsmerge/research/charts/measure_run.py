@@ -9,8 +9,6 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from gsmerge.compaction.compact import compact
-from gsmerge.compaction.left_out import choose_left_out
 from gsmerge.geometry.views import subset
 from gsmerge.io.formats.ply import file_bytes
 from gsmerge.io.jsonl import each_line
@@ -18,8 +16,10 @@ from gsmerge.prepare.prepare_scene import LEAST_VIEWS
 from gsmerge.reading.held_out import HeldOutViews, read_held_out
 from gsmerge.reading.read_scene import load_files
 from gsmerge.reading.scene_files import find_scene_files
+from gsmerge.road import compact
 from gsmerge.scoring.evaluate import INPUT, EvaluateOptions, evaluate
 from gsmerge.settings.compact import CompactOptions
+from gsmerge.special.left_out import choose_left_out
 from gsmerge.types import Gaussians, Scene, Views
 
 RUNS = "runs.jsonl"  # in the folder of a grid

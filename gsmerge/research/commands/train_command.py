@@ -67,8 +67,8 @@ def find_training_scenes(paths: Sequence[Path], out: Path, validation_scenes: Co
     A scene of ``validation_scenes`` is left out, unless ``paths`` name it. Raises SceneError if a path does
     not exist or has no scene, and UsageError if no scene is left.
     """
-    from gsmerge.batch.find import find_scenes
     from gsmerge.errors import UsageError
+    from gsmerge.jobs.batch.find import find_scenes
 
     kept, excluded = dict[str, Path](), {os.path.realpath(scene) for scene in validation_scenes}
     for path in paths:

@@ -11,11 +11,11 @@ from model_files import write_points_glb
 from plyfile import PlyData, PlyElement
 from tiny_scene import Tiny, write_colmap_binary, write_images, write_npz
 
-from gsmerge.batch.find import find_scenes
 from gsmerge.cli import main
 from gsmerge.errors import SceneError
 from gsmerge.io import write_gaussians
 from gsmerge.io.no_gaussians import POINTS_ONLY
+from gsmerge.jobs.batch.find import find_scenes
 from gsmerge.reading.scene_files import find_scene_files
 
 

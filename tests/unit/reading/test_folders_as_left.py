@@ -16,9 +16,9 @@ from model_rows import check_cameras, check_pixels
 from sweeps import sweep
 from tiny_scene import Tiny, frames_of, save_json, write_images, write_npz, write_transforms
 
-from gsmerge.batch.find import find_scenes, main_file
 from gsmerge.errors import SceneError
 from gsmerge.io import read_cameras, to_cameras
+from gsmerge.jobs.batch.find import find_scenes, main_file
 from gsmerge.reading.content_hash import list_files
 from gsmerge.reading.read_scene import load_scene
 from gsmerge.reading.scene_files import find_scene_files

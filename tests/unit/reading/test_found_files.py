@@ -14,8 +14,8 @@ from exports import export_rows, save_export, smooth_scene
 from messages import names, noted
 from tiny_scene import Tiny, rotation, write_colmap_binary, write_colmap_text, write_images, write_transforms
 
-from gsmerge.inspection.inspect import inspect
 from gsmerge.io import write_ply
+from gsmerge.jobs.inspect import inspect
 from gsmerge.reading.read_scene import Loaded, load_scene
 
 SMOOTH = smooth_scene(56, 40)

@@ -11,17 +11,17 @@ from messages import noted, refuses
 from plyfile import PlyData
 from tiny_scene import Tiny, make_tiny, write_inria
 
-from gsmerge.batch.find import find_scenes
 from gsmerge.cli import main
-from gsmerge.compaction.compact import compact_files
-from gsmerge.compaction.files import read_input
-from gsmerge.compaction.outputs import Outputs
 from gsmerge.errors import SceneError
-from gsmerge.inspection.file_checks import check_content
 from gsmerge.io import read_ply, write_gaussians, write_ply
 from gsmerge.io.formats.ply import header_content
 from gsmerge.io.formats.rows import RESULT_COMMENT
+from gsmerge.jobs.batch.find import find_scenes
+from gsmerge.jobs.file_checks import check_content
+from gsmerge.reading.input import read_input
 from gsmerge.reading.scene_files import find_scene_files
+from gsmerge.results.outputs import Outputs
+from gsmerge.road import compact_files
 from gsmerge.settings.compact import CompactOptions
 
 PLAIN = CompactOptions().with_settings({"superpixels": "20%", "fit": "none", "threads": 1, "levels": 2})

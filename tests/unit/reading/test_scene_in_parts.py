@@ -13,15 +13,15 @@ from tiny_scene import Tiny
 
 import gsmerge
 from gsmerge.cli import main
-from gsmerge.compaction.compact import compact_files
-from gsmerge.compaction.outputs import Outputs
 from gsmerge.errors import SceneError
 from gsmerge.io import write_ply
+from gsmerge.jobs.states.state_file import load_state
 from gsmerge.reading.content_hash import content_hash, list_files
 from gsmerge.reading.read_scene import load_scene, read_scene
 from gsmerge.reading.scene_files import find_scene_files
+from gsmerge.results.outputs import Outputs
+from gsmerge.road import compact_files
 from gsmerge.settings.compact import CompactOptions
-from gsmerge.states.state_file import load_state
 
 
 def split(folder: Path, tiny: Tiny, names: list[str], cuts: list[int]) -> Path:

@@ -23,9 +23,9 @@ from tiny_scene import (
 )
 
 from gsmerge.errors import SceneError
-from gsmerge.inspection.inspect import inspect
 from gsmerge.io import read_cameras, to_cameras
 from gsmerge.io.cameras.camera_file import make_lens, select_views, undistort_photos
+from gsmerge.jobs.inspect import inspect
 from gsmerge.kernels import elementary
 from gsmerge.reading.read_scene import load_scene
 

@@ -14,7 +14,6 @@ import scenes
 from slow_readers import drawn
 
 from gsmerge import Gaussians, Scene
-from gsmerge.compaction.outputs import name_outputs, write_outputs
 from gsmerge.errors import list_doubts
 from gsmerge.geometry.transforms import multiply_quats, project, quat_to_rotmat
 from gsmerge.io import read_gaussians, write_gaussians
@@ -23,6 +22,7 @@ from gsmerge.io.formats.glb import holds_gaussians
 from gsmerge.io.formats.read_gaussians import file_notes
 from gsmerge.io.formats.table import Contents
 from gsmerge.kernels.elementary import cos, sin
+from gsmerge.results.outputs import name_outputs, write_outputs
 
 NAME = "KHR_gaussian_splatting"
 NUMBERS = {"<f4": 5126, "|i1": 5120, "|u1": 5121, "<i2": 5122, "<u2": 5123}

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 from slow_readers import corners
 
-from gsmerge.compaction.convert import ConvertOptions, convert_files
-from gsmerge.compaction.outputs import name_outputs
 from gsmerge.io import kept_comments, read_gaussians, write_gaussians, write_ply
+from gsmerge.jobs.convert import ConvertOptions, convert_files
+from gsmerge.results.outputs import name_outputs
 from gsmerge.settings.placement import PlacementOptions
 
 

@@ -11,9 +11,9 @@ from splat_transform_programs import put_stand_in
 
 from gsmerge import read_gaussians
 from gsmerge.errors import GsmergeError, SceneError, UsageError
-from gsmerge.inspection.file_checks import check_content
 from gsmerge.io.formats import splat_transform
 from gsmerge.io.formats.splat_transform import VARIABLE
+from gsmerge.jobs.file_checks import check_content
 from gsmerge.reading.scene_files import find_scene_files
 
 

@@ -12,11 +12,11 @@ import scenes
 from messages import noted, refuses
 
 from gsmerge import Gaussians, read_gaussians, write_gaussians
-from gsmerge.compaction.convert import ConvertOptions, convert_files
-from gsmerge.compaction.outputs import Outputs, frame_notes, name_outputs
 from gsmerge.errors import SceneError
 from gsmerge.io.formats.spz import spz_bytes
 from gsmerge.io.formats.tileset import globe_matrix, most_bytes
+from gsmerge.jobs.convert import ConvertOptions, convert_files
+from gsmerge.results.outputs import Outputs, frame_notes, name_outputs
 from gsmerge.settings.files import FileOptions
 from gsmerge.types import NO_CAMERAS
 

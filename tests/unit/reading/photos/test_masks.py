@@ -16,9 +16,9 @@ from tiny_scene import Tiny
 
 from gsmerge.errors import SceneError
 from gsmerge.geometry.views import subset
-from gsmerge.inspection.inspect import inspect
 from gsmerge.io.image_names import match_masks
 from gsmerge.io.photo_files import decode_alpha, decode_levels
+from gsmerge.jobs.inspect import inspect
 from gsmerge.reading.read_scene import load_scene, read_scene
 
 

@@ -1,1 +1,0 @@
-"""Inspection of files: what they hold, whether they are sound, and what compact would make of them."""

@@ -1,0 +1,6 @@
+"""Compact many scenes with :func:`gsmerge.road.compact_files`, on this machine or on a cluster."""
+
+from gsmerge.jobs.batch.jobs import BatchOptions, Job, find_jobs
+from gsmerge.jobs.batch.run import run_batch
+
+__all__ = ["BatchOptions", "Job", "find_jobs", "run_batch"]

@@ -1,0 +1,233 @@
+"""Estimate the size, time and memory of a run without running it, as ``inspect`` and ``--dry-run`` show it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from gsmerge.errors import count_words
+from gsmerge.geometry.frame import canonicalise
+from gsmerge.io.formats.ply import file_bytes
+from gsmerge.io.formats.table import find_format
+from gsmerge.plan import (
+    FIDELITY_LOSS,
+    FIDELITY_PSNR,
+    TRIAL_SHARE,
+    choose_blocks,
+    load_networks,
+    plan_scene,
+    resolve_budget,
+    usual_builds,
+)
+from gsmerge.prepare.confirm_depths import confirm_depths
+from gsmerge.prepare.crop import crop_scene
+from gsmerge.prepare.prepare_scene import views_notes, without_repeats
+from gsmerge.prepare.scene_size import measure_size
+from gsmerge.reading.read_scene import Loaded
+from gsmerge.results.outputs import Outputs, with_output_name
+from gsmerge.road import compact_scene
+from gsmerge.runtime.documents import document_head, note_entries, note_lines
+from gsmerge.runtime.memory import human_bytes, memory_bytes, memory_problem
+from gsmerge.runtime.record import record_part, record_run
+from gsmerge.runtime.threads import available_threads, use_threads
+from gsmerge.scoring.coverage import shares_inside
+from gsmerge.settings.compact import OURS, CompactOptions
+from gsmerge.special.blocks.partition import gaussians_at_once
+from gsmerge.special.curve import curve_counts
+from gsmerge.special.methods import choose_method, is_without_views
+from gsmerge.stages.counts import level_counts
+from gsmerge.types import Scene
+
+# Most Gaussians of a scene without cameras for which the search is run; it takes seconds
+MAX_SEARCHED_GAUSSIANS = 500_000
+INSIDE_GAUSSIANS = 10_000  # sample of Gaussians for the share that lies inside a view
+BESIDE = ("cameras", "images", "masks", "protect")  # fields of SceneFiles that are read with the Gaussians
+# Costs of runs: means over whole runs with various settings. Estimates are right within a factor of about two
+IMPORT_SECONDS = 1.0  # imports, and the constant part of every run
+# Seconds for each million pixels of all views together, or for each million Gaussians if there are more Gaussians than
+# pixels:
+COST_BUILD = 1.0  # superpixels, merging and scores of a result
+COST_INPUT = 0.3  # reading and scoring the input
+COST_NETWORKS = 1.4  # the shipped networks
+COST_PAPER = 4.5  # the paper's networks, which have more inputs and refine
+COST_PAIRS = 3.0  # merging neighbours pair by pair
+COST_PLACED = 6.0  # drawing a scene without views from placed views
+COST_SLOW = {"greedy": 25.0, "splat-transform": 60.0}  # in addition, for slow methods
+# Seconds for each step of the fit:
+COST_STEP = 0.1  # per million pixels of its view
+COST_DRAWN = 0.25  # per million Gaussians that it draws
+THREAD_GAIN = 0.35  # speed of each thread after the first, relative to the first
+PLACED_PIXELS = 1 << 18  # largest number of pixels of a placed view
+
+
+@dataclass(frozen=True, eq=False)
+class RunCosts:
+    """Facts about a run that decide how many seconds it takes."""
+
+    settings: Mapping[str, Any]  # All settings by flat name, with the networks in use
+    num_pixels: int  # Pixels of all views together, or the number of Gaussians if it is larger
+    view_pixels: float  # Pixels of one view
+    inside: float  # Share of the result's Gaussians that a view draws
+    steps: int  # Steps of a fit; 0 without a fit
+    merges_pairs: bool = False  # Neighbours are merged pair by pair, instead of superpixels
+    is_placed: bool = False  # The views are placed, since the scene has none
+    num_builds: int = 1  # Results that are built until one has the quality that is asked for
+    curve: tuple[Sequence[int], int] = ((), 0)  # Counts and steps of the short fits of the scene's curve
+    has_trial: bool = False  # A trial estimates the quality of new views
+
+    def build_seconds(self, count: float, steps: int) -> float:
+        """Return the processor seconds to build ``count`` Gaussians with a fit of ``steps``."""
+        settings, method = self.settings, self.settings["method"]
+        work = COST_PAIRS if self.merges_pairs else COST_BUILD
+        work += COST_SLOW.get(settings["segmentation"] if method == OURS else method, 0.0)
+        if method == OURS and settings["checkpoint"] != "none":
+            work += COST_PAPER if "paper" in (settings["recipe"], settings["checkpoint"]) else COST_NETWORKS
+        view_pixels = min(self.num_pixels, PLACED_PIXELS) if self.is_placed else self.view_pixels
+        return (self.num_pixels * work + steps * (COST_STEP * view_pixels + COST_DRAWN * self.inside * count)) / 1e6
+
+    def seconds(self, count: float, coarser: Iterable[float], num_views: int, threads: int) -> float:
+        """Return the wall time of a run for ``count`` Gaussians, and for the ``coarser`` levels, with imports."""
+        build, (curve_counts, curve_steps) = self.build_seconds(count, self.steps), self.curve
+        work = build * (self.num_builds + TRIAL_SHARE * self.has_trial)
+        work += sum(self.build_seconds(point_count, curve_steps) for point_count in curve_counts)
+        work += sum(self.build_seconds(level_count, self.steps) for level_count in coarser)
+        work += self.num_pixels * (COST_PLACED if self.is_placed else COST_INPUT) / 1e6
+        return IMPORT_SECONDS + work / (1 + THREAD_GAIN * max(0, min(threads, num_views) - 1))
+
+
+def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
+    """Estimate size, time and memory of a run without running it.
+
+    Returns:
+        ``num_gaussians`` is the largest number of Gaussians that the result can have or, if ``exact``, the number that
+        it will have. If ``psnr_kept`` is a number, ``num_gaussians`` is the smallest number, and the run takes more
+        Gaussians until the PSNR against the input is ``psnr_kept`` dB. If ``loss_kept`` is a number, the run takes more
+        Gaussians until the result shows the photos at most ``loss_kept`` dB worse than the input. If ``quality`` is
+        given, the run takes more or fewer Gaussians until this quality is met. ``ratio`` is ``num_gaussians`` relative
+        to the input, and ``bytes`` is the size as a ``.ply``. ``superpixels_per_view`` is None if a budget distributes
+        superpixels among the views, and 0 if neighbouring Gaussians are merged instead of superpixels. ``blocks``,
+        ``method``, ``k``, ``match``, ``checkpoint``, ``fit`` and ``fit_steps`` are the values that the run would use.
+        ``seconds`` and ``memory_bytes`` have two digits, and are right within a factor of about two. ``memory_problem``
+        says that this machine has too little memory, or is None.
+    """
+    if options.clean.crop is not None:
+        scene = crop_scene(scene.numpy(), options.clean.crop)
+    num_input, (scene, *_) = scene.num_gaussians, without_repeats(scene)
+    size = measure_size(scene)
+    if (options.budget.auto or options.budget.is_limit) and scene.has_own_pixels:
+        options = resolve_budget(size, options, confirm_depths(canonicalise(scene)[0]))
+    plan, num_blocks = plan_scene(size, options), choose_blocks(size, options)
+    limits, settings = plan.limits, plan.settings
+    num_pixels = max(limits.num_pixels, scene.num_gaussians)
+    max_count = num_pixels if options.method.startswith("unmerged") else limits.count or limits.default
+    no_views = is_without_views(scene, options)
+    has_target = plan.keeps_fidelity or options.budget.target_psnr is not None
+    found_count = None
+    if no_views and has_target and num_input <= MAX_SEARCHED_GAUSSIANS:  # estimates find it by the search of a run
+        with use_threads(options.threads), record_part(silent=True):
+            found_count = len(compact_scene(scene, options.with_settings({"levels": 1, "crop": None})).gaussians)
+    count = found_count or min(scene.num_gaussians or num_pixels, max_count)
+    at_once, num_rest = gaussians_at_once(num_pixels, num_blocks), 3 * scene.gaussians.shN.shape[1]
+    num_drawn = num_pixels if options.method == "unmerged-fit" else count
+    fit = {OURS: plan.fit.fit, "unmerged-fit": "full"}.get(options.method, "none")
+    steps = 0 if fit == "none" else plan.fit.steps
+    all_pixels, budget = at_once * num_blocks, options.budget  # a view that is in two blocks is built twice
+    # the mean over all views of the share of the scene's Gaussians that lies in the view
+    inside = 1.0 if no_views else float(np.mean(shares_inside(scene, INSIDE_GAUSSIANS) or [1.0]))
+    has_curve = (budget.auto or budget.max_drop is not None) and not (has_target or size.rendered)
+    curve = curve_counts(budget.max_drop, limits.default, limits.min_count, limits.max_count) if has_curve else ([], 0)
+    costs = RunCosts(
+        settings=settings, num_pixels=all_pixels, view_pixels=all_pixels / max(1, len(scene)), inside=inside,
+        steps=steps, merges_pairs=no_views, is_placed=no_views,
+        num_builds=usual_builds(has_target=has_target, rendered=size.rendered), curve=curve,
+        has_trial=steps > 0 and scene.has_own_pixels and options.new_views is not False,
+    )  # fmt: skip
+    coarser = level_counts(num_drawn, budget.levels, limits.min_count)
+    seconds = costs.seconds(num_drawn, coarser, len(scene), options.threads or available_threads())
+    memory = memory_bytes(at_once, num_rest=num_rest, num_elsewhere=num_pixels - at_once)
+    is_distributed = limits.count is not None or budget.auto
+    return {
+        "num_gaussians": count,
+        "exact": options.budget.is_filled or found_count is not None,
+        "psnr_kept": FIDELITY_PSNR if plan.keeps_fidelity and size.rendered and found_count is None else None,
+        "quality": options.budget.quality if found_count is None else None,
+        "loss_kept": FIDELITY_LOSS if plan.keeps_fidelity and not size.rendered else None,
+        "ratio": count / max(1, num_input),
+        "bytes": file_bytes(count, scene.gaussians.sh_degree),
+        "blocks": num_blocks,
+        "method": options.method,
+        "superpixels_per_view": 0 if plan.merges_pairs else None if is_distributed else limits.per_view,
+        **{name: settings[name] for name in ("k", "match", "checkpoint")},
+        "fit": fit,
+        "fit_steps": plan.fit.steps,
+        "seconds": float(f"{seconds:.2g}"),
+        "memory_bytes": int(float(f"{memory:.2g}")),
+        "memory_problem": memory_problem(memory),
+    }
+
+
+def estimate_lines(run: Mapping[str, Any]) -> list[str]:
+    """Describe what :func:`estimate` returns in lines of text."""
+    per_view = run["superpixels_per_view"]
+    superpixels = "superpixels where the scene needs them"
+    if per_view is not None:
+        superpixels = f"{per_view:,} superpixels per view, {count_words(run['k'], 'Gaussian')} each"
+    method = f"{superpixels}; merging across views: {run['match']}; networks: {run['checkpoint']}"
+    if per_view == 0:
+        method = "neighbours merged pair by pair, because no photo shows them"
+    count = f"{run['num_gaussians']:,} Gaussians ({100 * run['ratio']:.1f} %)"
+    number = count if run["exact"] else f"at most {count}"
+    if run["psnr_kept"] is not None:
+        number = f"{count}, or more until the PSNR against the input is {run['psnr_kept']:g} dB"
+    if run["quality"] is not None:
+        number = f"{count}, or more or fewer until --quality {run['quality']} is met"
+    if run["loss_kept"] is not None:
+        number = f"{count}, or more until the photos are shown within {run['loss_kept']:g} dB of the input"
+    return [
+        f"compact    {number},"
+        f" {human_bytes(run['bytes'])} as .ply, in about {run['seconds']:g} s with {run['memory_bytes'] / 1e9:g} GB of"
+        " memory" + (f", in {run['blocks']} blocks" if run["blocks"] > 1 else ""),
+        f"method     {method if run['method'] == 'gsmerge' else run['method']}; fit: {run['fit']}",
+        *([f"memory     {run['memory_problem']}"] if run["memory_problem"] else []),
+    ]
+
+
+def estimate_files(load: Loaded, settings: CompactOptions, outputs: Outputs) -> dict[str, Any]:
+    """Return the document of ``--dry-run``: what :func:`gsmerge.road.compact_files` would make."""
+    scene, out, settings = load.scene, outputs.result, with_output_name(settings, outputs)
+    notes = [*load.notes, *views_notes(scene)]
+    if os.path.lexists(out) and not outputs.overwrite:
+        notes.append(f"{out} exists already: --overwrite would replace it")
+    with record_run() as record:
+        choose_method(settings, scene)  # for its notes and errors
+        if settings.method == OURS and settings.checkpoint != "auto":  # raises the errors of a named checkpoint
+            load_networks(settings, measure_size(scene))
+        run = estimate(scene, settings)
+    paths = {name: path and str(path) for name, path in vars(load.files).items() if name in BESIDE}
+    return {
+        **document_head(),
+        "dry_run": True,
+        "input": load.recognised | paths,
+        "output": {"path": str(out)},
+        "compact": run,
+        "options": settings.to_dict(),
+        **note_entries([*notes, *record.notes]),
+    }
+
+
+def dry_run_lines(document: Mapping[str, Any]) -> list[str]:
+    """Describe the document of :func:`estimate_files` in lines of text."""
+    scene, out = document["input"], document["output"]["path"]
+    number, size = scene["num_views"], f"{scene['width']} x {scene['height']}"
+    inside = find_format(out).levels == "inside"
+    levels = f", and {count_words(document['options']['levels'], 'level')} in chunks beside it" if inside else ""
+    return [
+        f"would read {scene['path']}: {f'{number} views of {size}' if number else 'no views'}",
+        f"would write {out}{levels}",
+        *estimate_lines(document["compact"]),
+        *note_lines(document["notes"]),
+    ]

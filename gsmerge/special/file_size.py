@@ -1,0 +1,104 @@
+"""Meet a budget in bytes, in compressed formats, where the number of Gaussians alone does not give the bytes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from gsmerge.errors import UsageError
+from gsmerge.io.formats.rows import MIP_COMMENT, RESULT_COMMENT
+from gsmerge.io.formats.table import Contents, Format
+from gsmerge.plan import Plan
+from gsmerge.prepare.prepare_scene import Prepared
+from gsmerge.results.candidate import Candidate, rescore
+from gsmerge.runtime.memory import human_bytes
+from gsmerge.runtime.record import add_seconds
+from gsmerge.special.clean_up import build_candidate
+from gsmerge.stages.clean import faintest_dropped
+from gsmerge.types import Cameras, Gaussians
+
+BUILD_SURPLUS = 1.02  # Gaussians of a build, relative to the number that seems to fit
+MOST_MEASURED = 8  # most files that are measured to choose how many Gaussians are dropped
+MAX_REBUILDS = 2  # most builds after the first one
+
+
+def measure_bytes(gaussians: Gaussians, file: Format, cameras: Cameras, names: Sequence[str] = ()) -> int:
+    """Return how many bytes a file with these Gaussians and cameras has, or an upper bound if it is a page."""
+    comments = RESULT_COMMENT, MIP_COMMENT
+    if file.measure is not None:
+        return file.measure(gaussians, cameras, comments)
+    if file.encode_contents is not None:
+        contents = Contents([gaussians], comments, cameras if names else cameras[:0], names)
+        placed_bytes = 700  # most bytes of the camera that is written if the scene has none
+        return len(file.encode_contents(gaussians, contents)) + placed_bytes * (file.first_view and not names)
+    assert file.encode is not None  # all other formats have a fixed number of bytes for each Gaussian
+    return len(file.encode(gaussians, comments))
+
+
+def meet_bytes(candidate: Candidate, prepared: Prepared, plan: Plan) -> Candidate:
+    """Make the file of a candidate nearly as large as a budget in bytes allows.
+
+    The candidate is rebuilt with other counts until its file is about as large as allowed. The faintest Gaussians of
+    the last build are dropped until the file fits.
+    """
+    assert plan.file_size is not None, "a budget in bytes"
+    max_bytes, file = plan.file_size.num_bytes, plan.file_size.file
+    names = prepared.input_scene.names
+    base_bytes = measure_least_bytes(candidate.gaussians, max_bytes, file, candidate.cameras, names)
+
+    def choose_next(built: Sequence[Candidate]) -> int | None:
+        """Return the count whose file is expected to be as large as allowed; None if the last build is near enough."""
+        last, count = built[-1], len(built[-1].gaussians)
+        num_bytes = measure_bytes(last.gaussians, file, last.cameras, names)
+        expected_count = int(BUILD_SURPLUS * count * (max_bytes - base_bytes) / max(num_bytes - base_bytes, 1))
+        next_count = min(expected_count, plan.limits.most)
+        # Gaussians that no view sees were dropped from the requested number, and no other Gaussians take their place
+        requested_count = max(count, last.count or 0)
+        requested_bytes = base_bytes + (num_bytes - base_bytes) * requested_count / max(count, 1)
+        near_share = 0.97  # share of the allowed bytes that is near enough
+        is_large_enough = requested_bytes >= near_share * max_bytes or next_count <= BUILD_SURPLUS * requested_count
+        most_dropped = 0.08  # largest share of the Gaussians that may be dropped from the last build
+        is_small_enough = next_count >= (1 - most_dropped) * count
+        return None if (is_large_enough and is_small_enough) or len(built) > MAX_REBUILDS else next_count
+
+    built = [candidate]
+    while (count := choose_next(built)) is not None:
+        candidate = build_candidate(prepared, plan, count)
+        add_seconds(candidate.record.seconds)
+        built.append(candidate)
+    gaussians = drop_to_bytes(candidate.gaussians, max_bytes, file, candidate.cameras, names, base_bytes)
+    return candidate if len(gaussians) == len(candidate.gaussians) else rescore(candidate, gaussians, prepared, plan)
+
+
+def measure_least_bytes(
+    gaussians: Gaussians, max_bytes: int, file: Format, cameras: Cameras, names: Sequence[str] = ()
+) -> int:
+    """Return the bytes of a file with one Gaussian; UsageError if this file has more than ``max_bytes``."""
+    base_bytes = measure_bytes(gaussians[:1], file, cameras, names)
+    if base_bytes > max_bytes:
+        problem = f"expected at least {human_bytes(base_bytes)} for a {file.ending} with one Gaussian"
+        raise UsageError(f"budget: {problem}, got {human_bytes(max_bytes)}")
+    return base_bytes
+
+
+def drop_to_bytes(
+    gaussians: Gaussians, max_bytes: int, file: Format, cameras: Cameras, names: Sequence[str], base_bytes: int
+) -> Gaussians:
+    """Keep about as many of the largest and most opaque Gaussians as fit into ``max_bytes``.
+
+    ``base_bytes`` are the bytes of a file with one Gaussian.
+    """
+    fitting_count, most_count = 0, len(gaussians)  # the largest count that is known to fit, and the largest that may
+    fitting, count = gaussians[:0], len(gaussians)
+    full_share = 0.985  # a file with this share of ``max_bytes`` is full enough
+    for _ in range(MOST_MEASURED):
+        kept = gaussians if count == len(gaussians) else faintest_dropped(gaussians, count)
+        num_bytes = measure_bytes(kept, file, cameras, names)
+        if num_bytes <= max_bytes:
+            fitting_count, fitting = count, kept
+        else:
+            most_count = count - 1
+        if fitting_count >= most_count or (fitting_count and full_share * max_bytes <= num_bytes <= max_bytes):
+            break
+        expected_count = int(count * ((1 + full_share) / 2 * max_bytes - base_bytes) / max(num_bytes - base_bytes, 1))
+        count = min(max(fitting_count + 1, expected_count), most_count)
+    return fitting
