@@ -266,19 +266,7 @@ def decode_levels(path: Path, photo: Path | None = None) -> np.ndarray:
     exceeds. Memory is limited by the bytes of the mask's file and of its ``photo`` together, since masks compress to
     very few bytes.
     """
-    budget = _photo_budget(path, *([] if photo is None else [photo]))
-    with _open_pixels(path) as image:
-        _check_pillow_memory(budget, image)
-        if image.mode[0] in "IF":  # more than 8 bits
-            grey = np.asarray(image)
-        else:
-            grey = np.empty(image.size[::-1], np.uint8)
-            for top in range(0, image.height, _BAND):  # copies of a band take little memory
-                band = image.crop((0, top, image.width, min(top + _BAND, image.height)))
-                rows = grey[top : top + _BAND]
-                rows[:] = band.convert("L")
-                if "A" in image.getbands():
-                    rows[:] = np.round(rows * np.asarray(band.getchannel("A"), np.float32) / 255)
+    grey = _decode_brightness(path, _photo_budget(path, *([] if photo is None else [photo])))
     brightest = float(grey.max(initial=0))
     whites = 1, 255, 65535  # of fractions or of 0 and 1, of 8 bits, and of 16 bits
     white = next(
@@ -291,6 +279,25 @@ def decode_levels(path: Path, photo: Path | None = None) -> np.ndarray:
         block = slice(top, top + _BAND)
         levels[block] = np.round(np.clip(grey[block] * (255 / white), 0, 255))
     return levels
+
+
+def _decode_brightness(path: Path, budget: ReadBudget) -> np.ndarray:
+    """Decode the brightness ``[h,w]`` that a file stores; in 8-bit images, brightness times opacity.
+
+    A function of its own, since Pillow's copy of the image has to be gone before its levels are computed.
+    """
+    with _open_pixels(path) as image:
+        _check_pillow_memory(budget, image)
+        if image.mode[0] in "IF":  # more than 8 bits
+            return np.asarray(image)
+        grey = np.empty(image.size[::-1], np.uint8)
+        for top in range(0, image.height, _BAND):  # copies of a band take little memory
+            band = image.crop((0, top, image.width, min(top + _BAND, image.height)))
+            rows = grey[top : top + _BAND]
+            rows[:] = band.convert("L")
+            if "A" in image.getbands():
+                rows[:] = np.round(rows * np.asarray(band.getchannel("A"), np.float32) / 255)
+        return grey
 
 
 def decode_alpha(path: Path) -> np.ndarray | None:

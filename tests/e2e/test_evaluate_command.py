@@ -96,12 +96,12 @@ def test_lpips_is_measured_with_alexnet_on_four_views(scene: Path, run: Run, mon
 
 
 @pytest.mark.slow
-def test_outputs_of_evaluate_replace_only_its_own_files(scene: Path, run: Run) -> None:
+def test_outputs_of_evaluate_replace_files_only_when_told_to(scene: Path, run: Run) -> None:
     outputs = {suffix: scene / f"page.{suffix}" for suffix in ("json", "csv")}
     flags = [part for path in outputs.values() for part in ("-o", path)]
     call = ("evaluate", scene / "scene.ply", scene / "small.ply", "--lpips", "none")
     run(*call, *flags, code=0)
-    run(*call, *flags, code=0)  # what it made is replaced
+    run(*call, *flags, "--overwrite", code=0)
     for path in outputs.values():
         path.write_text("mine")
         assert_refused(run(*call, "-o", path), 2, path, "exists already")

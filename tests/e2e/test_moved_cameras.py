@@ -84,4 +84,4 @@ def test_render_looks_from_moved_cameras_beside_broken_photos(
     floor(psnr(tmp_path / "out", photos))
     broken, sheet = moved_scene / "images", ("render", moved_scene / "scene.ply", "-o", tmp_path / "sheet.png")
     assert names(run(*sheet, code=0).err, f"the photos in {broken} are left out", "cannot be decoded")
-    assert_refused(run(*sheet, "--overwrite", "--images", broken), 3, broken / "view_000.png", "cannot be decoded")
+    assert_refused(run(*sheet, "--overwrite", "--images", broken), 3, broken, "view_000.png", "cannot be decoded")

@@ -48,5 +48,5 @@ def test_a_light_page_leaves_the_scene_out_of_3d(smallest_scene: Path, tmp_path:
     assert said["headline"].startswith("4.3 % of the Gaussians, ")  # 50 of 1,152
     assert [name for name, _ in sources(page)] == ["photo", "input", "small.ply"]
     assert said["bytes"] == page.stat().st_size
-    run("view", smallest_scene, result, "--no-open", "-o", page, "--light", code=0)
+    run("view", smallest_scene, result, "--no-open", "-o", page, "--light", "--overwrite", code=0)
     assert [splats is None for _, splats in sources(page)] == [True, True, False]
