@@ -24,14 +24,23 @@ from gsmerge.prepare.scene_size import SceneSize
 from gsmerge.raster.photos import scored_tiles
 from gsmerge.runtime.record import RunPart, note, stage
 from gsmerge.settings.budget import AUTO
-from gsmerge.settings.compact import CHECKPOINTS, OURS, CompactOptions
+from gsmerge.settings.compact import CHECKPOINTS, COUNTS, OURS, CompactOptions
 from gsmerge.settings.fit import GROW_ROUNDS, GROW_STEPS, STEPS, USUAL_SHARE, FitOptions
-from gsmerge.settings.stages import SHARE, USUAL_K, CleanOptions, DecodeOptions, MatchOptions
+from gsmerge.settings.setting import flat_settings
+from gsmerge.settings.stages import (
+    SHARE,
+    USUAL_K,
+    CleanOptions,
+    DecodeOptions,
+    MatchOptions,
+    PrepareOptions,
+    SegmentOptions,
+)
 from gsmerge.stages.counts import CountLimits, FileSize, count_limits, file_size, has_few_rows, max_allowed
 from gsmerge.stages.fit_pairs import choose_power
 from gsmerge.stages.pair_merge import POWERS
 from gsmerge.stages.segment import SharedTree, SuperpixelChoices
-from gsmerge.types import Gaussians
+from gsmerge.types import Gaussians, Scene
 
 if TYPE_CHECKING:
     from gsmerge.networks.checkpoint import Checkpoint
@@ -196,6 +205,13 @@ def make_plan(
         # a quality that the user asks for is measured on all pixels, and small views have too few tiles for a sample
         samples = plan.target_psnr is None and not plan.keeps_fidelity
         samples = samples and scored_tiles(0, cameras.width, cameras.height, 2) is not None
+        # Views among those whose pictures show the scene. The effort decides how many a report needs; scores that
+        # decide the number of Gaussians take more. All views that were placed count
+        scored = own_views(prepared)
+        if not prepared.reference.placed:
+            report_views, num_views = EFFORTS[options.effort].report_views, len(scored)
+            chosen = pick_views(num_views, report_views) if samples else scored_views(num_views)
+            scored = tuple(scored[i] for i in chosen)
         # all builds of a run share one tree of regions, by which they cut the views
         has_tree = plan.has_quality or plan.levels > 1 or plan.limits.count is not None
         has_tree = has_tree and cuts_views(options, size) and not merges_pairs
@@ -205,7 +221,7 @@ def make_plan(
             fit=fit,
             merges_pairs=merges_pairs,
             file_size=file_size(budget),
-            scored_views=_choose_scored_views(prepared, EFFORTS[options.effort] if samples else None),
+            scored_views=scored,
             samples=samples,
             checkpoint=checkpoint,
             settings=replace(options, decode=plan.decode).to_dict() | {"fit_steps": fit.steps},
@@ -267,6 +283,22 @@ def plan_scene(
     )
 
 
+def is_without_views(scene: Scene, options: CompactOptions) -> bool:
+    """Return whether a run works without views: the scene has none, and no option asks for a stage that needs views.
+
+    Without views, Gaussians are merged with their neighbours, by positions and colours alone.
+    """
+    return len(scene) == 0 and not options.replaces_stages
+
+
+def note_ignored(scene: Scene, options: CompactOptions) -> None:
+    """Add a note on changed settings that have no effect because the scene has no views."""
+    kinds = (PrepareOptions, SegmentOptions, MatchOptions, DecodeOptions)
+    ignored = options.changed(name for kind in kinds for name in flat_settings(kind) if name not in COUNTS)
+    if ignored and is_without_views(scene, options):
+        note(f"these settings have no effect without cameras: {', '.join(ignored)}")
+
+
 def fill_options(prepared: Prepared, options: CompactOptions) -> CompactOptions:
     """Fill in budget, K, superpixels and clean-up if the options leave them to the scene; notes say why."""
     size, agreement = prepared.size, prepared.agreement
@@ -308,25 +340,19 @@ def choose_blocks(scene: SceneSize, options: CompactOptions) -> int:
     return count
 
 
-def usual_blocks(num_gaussians: int, num_views: int) -> int:
-    """Return the number of blocks that a scene has by default.
-
-    If the views alone decide the number, it is an upper limit.
-    """
-    if num_gaussians > WHOLE_GAUSSIANS:
-        return -(-num_gaussians // BLOCK_GAUSSIANS)
-    return 1 if num_views <= WHOLE_VIEWS else -(-num_views // BLOCK_VIEWS)
-
-
 def wanted_blocks(options: CompactOptions, num_gaussians: int, num_views: int = 0) -> int:
     """Return the largest number of blocks that a run may have by its options; 1 for a run in one piece.
 
-    A small ``num_views`` does not change the number.
+    If the views alone decide the number, it is an upper limit. A small ``num_views`` does not change the number.
     """
     blocks = options.blocks.blocks
-    if blocks == "auto":
-        return 1 if options.uncut else usual_blocks(num_gaussians, num_views)
-    return 1 if blocks == "none" else int(blocks)
+    if blocks != "auto":
+        return 1 if blocks == "none" else int(blocks)
+    if options.uncut:
+        return 1
+    if num_gaussians > WHOLE_GAUSSIANS:
+        return -(-num_gaussians // BLOCK_GAUSSIANS)
+    return 1 if num_views <= WHOLE_VIEWS else -(-num_views // BLOCK_VIEWS)
 
 
 def keeps_fidelity(scene: SceneSize, options: CompactOptions) -> bool:
@@ -515,19 +541,6 @@ def fit_to_pictures(prepared: Prepared, options: CompactOptions, fit: FitOptions
         note(NO_FIT)
     tuning = replace(fit.tuning, max_ratio=math.inf)
     return replace(fit, scored=False, beyond=True, fills=True, min_contribution=0.0, tuning=tuning)
-
-
-def _choose_scored_views(prepared: Prepared, effort: Effort | None) -> tuple[int, ...]:
-    """Choose the views that score input and result, among those whose pictures show the scene.
-
-    ``effort`` decides how many views the report needs. None: the scores of the views decide the number of Gaussians,
-    which takes more views than a report.
-    """
-    own = own_views(prepared)
-    if prepared.reference.placed:
-        return own
-    chosen = scored_views(len(own)) if effort is None else pick_views(len(own), effort.report_views)
-    return tuple(own[i] for i in chosen)
 
 
 def own_views(prepared: Prepared) -> tuple[int, ...]:

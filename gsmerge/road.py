@@ -21,9 +21,9 @@ from gsmerge.io.formats.rounding import format_notes
 from gsmerge.io.formats.rows import result_comments
 from gsmerge.io.formats.table import Contents
 from gsmerge.pipeline import build
-from gsmerge.plan import Plan, choose_blocks, make_plan, run_parts
+from gsmerge.plan import Plan, choose_blocks, is_without_views, make_plan, note_ignored, run_parts
 from gsmerge.prepare.crop import crop_scene
-from gsmerge.prepare.prepare_scene import Prepared
+from gsmerge.prepare.prepare_scene import Prepared, prepare
 from gsmerge.prepare.row_colors import RENDERS
 from gsmerge.prepare.scene_size import measure_size
 from gsmerge.reading.content_hash import doubt_changed
@@ -38,16 +38,15 @@ from gsmerge.results.outputs import (
     frame_notes,
     list_first_layers,
     refuse_to_replace_cameras,
-    with_output_name,
+    settings_for,
 )
 from gsmerge.results.report import report_document
 from gsmerge.results.result import CompactResult, make_result
 from gsmerge.runtime.arguments import check_arguments
 from gsmerge.runtime.record import Progress, begin_part, expect_parts, note, record_part, record_run
 from gsmerge.runtime.threads import use_threads
-from gsmerge.settings.compact import CompactOptions
+from gsmerge.settings.compact import OURS, CompactOptions
 from gsmerge.settings.reading import OpacityChoice
-from gsmerge.special.methods import choose_method
 from gsmerge.types import Scene, StrPath
 
 if TYPE_CHECKING:
@@ -120,7 +119,7 @@ def compact_files(
     Returns the report, see :func:`gsmerge.results.report.report_document`. Raises SceneError if the scene cannot be
     read or the result cannot be written, and UsageError if the scene lacks something that the settings need.
     """
-    start, out, settings = perf_counter(), outputs.result, with_output_name(settings, outputs)
+    start, out, settings = perf_counter(), outputs.result, settings_for(outputs, settings)
     format_ = outputs.format
     with atomic_outputs(overwrite=outputs.overwrite) as add:
         temporary = add(out)  # before the long work, so that an output that cannot be written ends the run at once
@@ -173,12 +172,23 @@ def compact_scene(scene: Scene, options: CompactOptions) -> CompactResult:
         result = compact_in_blocks(scene, options, size, num_blocks)
         if result is not None:  # the views are worth several blocks
             return result.for_scene(whole)
-    method = choose_method(options, scene)
-    prepared = method.prepare(scene.numpy(), options.prepare)
-    result = compact_prepared(prepared, make_plan(prepared, options, run=method.run))
+    result = compact_prepared(*plan_run(scene, options))
     if result.report.is_far and options.scene_decides:
         result = compact_simpler(scene, options, result)
     return result.for_scene(whole)
+
+
+def plan_run(scene: Scene, options: CompactOptions) -> tuple[Prepared, Plan]:
+    """Prepare a scene, and plan its run."""
+    if options.method != OURS:
+        from gsmerge.special.methods import choose_method
+
+        method = choose_method(options, scene)
+        prepared = method.prepare(scene.numpy(), options.prepare)
+        return prepared, make_plan(prepared, options, run=method.run)
+    note_ignored(scene, options)
+    prepared = prepare(scene.numpy(), options.prepare, pixels=not is_without_views(scene, options))
+    return prepared, make_plan(prepared, options)
 
 
 def compact_prepared(prepared: Prepared, plan: Plan) -> CompactResult:
@@ -222,9 +232,7 @@ def compact_simpler(scene: Scene, options: CompactOptions, result: CompactResult
             continue
         with record_part():
             note(Doubt(f"{cause}; so it was made again {words}"))
-            method = choose_method(simpler, scene)
-            prepared = method.prepare(scene.numpy(), simpler.prepare)
-            result = compact_prepared(prepared, make_plan(prepared, simpler, run=method.run))
+            result = compact_prepared(*plan_run(scene, simpler))
         if not result.report.is_far:
             return result
     problem, budget = f"expected a result as good as its input, found none: {cause}", max(1, len(result.gaussians))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import ctypes
 import gc
 import os
 import shutil
@@ -14,6 +15,10 @@ from contextlib import suppress
 from typing import NoReturn
 
 INTERRUPTED = 130  # exit code
+# Parameters of glibc with their values, see mallopt(3). An array of 32 MiB or more gets separate pages, which return to
+# the system when the array is deleted. The process keeps up to 256 MiB of the memory of deleted smaller arrays for new
+# arrays. With glibc's default values, the system clears new pages for each array, a tenth of the time of `view`
+M_MMAP_THRESHOLD, M_TRIM_THRESHOLD = (-3, 1 << 25), (-1, 1 << 28)
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -74,9 +79,14 @@ def stop_at_once(*_: object) -> NoReturn:
 def program() -> NoReturn:
     """Run :func:`main` as the installed program, and end the process.
 
-    Exit handlers run, and output is flushed. The interpreter is not shut down, because freeing gigabytes of arrays
-    takes time.
+    New arrays reuse the memory of deleted arrays, if the C library can. The process then keeps more memory than it
+    uses. At the end exit handlers run, and output is flushed. The interpreter is not shut down, because freeing
+    gigabytes of arrays takes time.
     """
+    with suppress(AttributeError, OSError, TypeError):  # not glibc
+        mallopt = ctypes.CDLL(None).mallopt
+        for parameter, value in (M_MMAP_THRESHOLD, M_TRIM_THRESHOLD):
+            mallopt(parameter, value)
     if signal.getsignal(signal.SIGINT) == signal.default_int_handler:
         signal.signal(signal.SIGINT, stop_at_once)
     if os.name != "nt" and os.environ.get("TERM", "") in ("dumb", "unknown", "") and not os.environ.get("FORCE_COLOR"):

@@ -13,7 +13,7 @@ import typer
 
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import print_document, say, say_notes, separate_stdout, stage_progress, terminal_columns
-from gsmerge.cli.paths import check_outputs, default_output, input_files, output_file
+from gsmerge.cli.paths import check_outputs, input_files, output_file
 from gsmerge.errors import Doubt, TargetError, UsageError, split_notes
 from gsmerge.settings.compact import CHECKPOINTS, CompactOptions
 from gsmerge.settings.files import FileOptions
@@ -79,8 +79,8 @@ def compact(
     settings = replace(settings, blocks=replace(settings.blocks, engine=engine))
     features = _find_features(scenes)
     source = features or _find_files(scenes, output, cameras, images=images, masks=masks, protect=protect)
-    default = default_output(source if isinstance(source, Path) else source.base)
-    out = output_file(output or default, default.name)
+    ply = source if isinstance(source, Path) else source.base
+    out = output_file(output or ply.parent, f"{ply.stem}.compact.ply")
     run = Run(scenes[0], out, start, overwrite, dry_run, strict, json, quiet, has_page=open is not None)
     # A page cannot show joined scenes or Feature Gaussians, so only the result is shown
     on_page = [scenes[0], out] if features is None and len(scenes) == 1 else [out]
@@ -89,8 +89,7 @@ def compact(
         raise UsageError(f"{out}: exists already; {view_command} shows it, --overwrite makes it again")
     loaded = None
     if isinstance(source, Path):
-        _refuse_options(context, source)
-        _decode_features(source, given, run)
+        _decode_features(context, source, given, run)
     else:
         has_levels = "levels" in given.values
         loaded = _compact_files(source, settings, writing, opt.read_hints(hint), run, has_levels=has_levels)
@@ -106,20 +105,35 @@ def _compact_files(
 
     ``has_levels``: the user gave the number of levels.
     """
+    from gsmerge.io.formats.table import estimate_counts
+    from gsmerge.io.formats.write import level_output
+    from gsmerge.plan import wanted_blocks
+    from gsmerge.results.outputs import name_outputs, settings_for
+    from gsmerge.runtime.memory import memory_bytes, memory_problem
+    from gsmerge.special.blocks.partition import gaussians_at_once
+
     engine = settings.blocks.engine.engine
     if engine == "ray" and not run.dry_run:
         from gsmerge.runtime.work import require_ray
 
         require_ray()
-    from gsmerge.results.outputs import name_outputs
-
     outputs = name_outputs(run.out, writing, overwrite=run.overwrite)
-    settings = _choose_levels(settings, outputs, has_levels=has_levels)
-    _check_outputs(files, settings, outputs, overwrite=run.overwrite or run.dry_run)
+    settings = settings_for(outputs, settings, has_levels=has_levels)
+    # Results in several formats share a camera file, which may exist already, unless --overwrite replaces it
+    replaced_cameras = outputs.viewer_cameras if outputs.overwrite else None
+    num_files = settings.budget.levels if outputs.format.levels == "apart" else 1
+    written = [*outputs.paths, *(level_output(run.out, level) for level in range(1, num_files)), replaced_cameras]
+    networks = [] if settings.checkpoint in CHECKPOINTS else [Path(settings.checkpoint)]
+    check_outputs(written, (*input_files(files), *networks), overwrite=run.overwrite or run.dry_run)
     if run.dry_run:
         print_estimate(files, settings, outputs, reading, as_json=run.json)
         return None
-    _warn_of_memory(files, settings, quiet=run.silent)
+    # Warn before reading if the scene, or the largest of its blocks, is not likely to fit into memory
+    count, num_rest = estimate_counts([ply for scene_files in (files, *files.more) for ply in scene_files.plys])
+    at_once = gaussians_at_once(count, wanted_blocks(settings, count))
+    problem = memory_problem(memory_bytes(at_once, num_rest=num_rest, num_elsewhere=count - at_once))
+    if problem is not None:
+        say(problem, kind="warning", quiet=run.silent)
     from gsmerge.road import compact_files
 
     loads: list[Loaded] = []
@@ -130,7 +144,6 @@ def _compact_files(
             hashed=run.json, seconds_before=seconds_before, on_read=loads.append,
         )  # fmt: skip
     _print_result(document, run)
-    _judge_result(document, run)
     return loads[0]
 
 
@@ -150,64 +163,24 @@ def _show_page(on_page: Sequence[Path], loaded: "Loaded | None", run: Run, *, op
         show_page(loaded.files, after, loaded=loaded, open=open and not run.json, quiet=run.silent)
 
 
-def _choose_levels(settings: CompactOptions, outputs: "Outputs", *, has_levels: bool) -> CompactOptions:
-    """Choose the number of levels by the format of the output, and check that the format allows the settings.
-
-    UsageError if there are several levels, or a budget in bytes, and the format cannot have these.
-    """
-    from gsmerge.stages.counts import STREAMED_LEVELS
-
-    out, format_ = outputs.result, outputs.format
-    if format_.levels == "inside" and settings.method == "gsmerge" and not has_levels:
-        settings = settings.with_settings({"levels": STREAMED_LEVELS})
-    if not format_.levels and settings.budget.levels > 1:
-        levels, kind = settings.budget.levels, format_.about.partition(":")[0]
-        raise UsageError(f"{out}: expected one level in {kind}, found --levels {levels}; drop --levels")
-    if settings.budget.in_bytes and not format_.gaussian_bytes:
-        raise UsageError(f"{out}: expected a --budget in Gaussians for this format, got {settings.budget.budget}")
-    return settings
-
-
-def _check_outputs(files: "SceneFiles", settings: CompactOptions, outputs: "Outputs", *, overwrite: bool) -> None:
-    """Raise an error if a file of the result cannot be written."""
-    from gsmerge.io.formats.write import level_output
-
-    num_files = settings.budget.levels if outputs.format.levels == "apart" else 1
-    levels = [level_output(outputs.result, level) for level in range(1, num_files)]
-    networks = [] if settings.checkpoint in CHECKPOINTS else [Path(settings.checkpoint)]
-    # Results in several formats share a camera file, which may exist already, unless --overwrite replaces it
-    replaced_cameras = outputs.viewer_cameras if outputs.overwrite else None
-    paths = (*outputs.paths, *levels, replaced_cameras)
-    check_outputs(paths, (*input_files(files), *networks), overwrite=overwrite)
-    if outputs.options.columns == "full" and settings.budget.in_bytes:
-        raise UsageError(f"columns full: expected a --budget that is a number or a share, got {settings.budget.budget}")
-
-
 def _print_result(document: Mapping[str, Any], run: Run) -> None:
-    """Print the report of a run and, unless a page will show the result, how to view it."""
+    """Print the report of a run and, unless a page will show the result, how to view it.
+
+    Warns of a result that is worse than its input. Raises TargetError for a missed target or, with ``--strict``, a
+    doubt.
+    """
+    from gsmerge.io.formats.table import VIEWED
     from gsmerge.results.report import result_table
 
-    notes = split_notes(document["notes"], "worse")[1]  # :func:`_judge_result` prints the others
+    notes = split_notes(document["notes"], "worse")[1]  # that it is worse is printed after the report
     say_notes([note for note in notes if not (run.strict and isinstance(note, Doubt))], quiet=run.silent)
-    columns = terminal_columns(sys.stdout)
-    next_step = None if columns is None or run.has_page else _view_command(run.scene, run.out)
+    columns, next_step = terminal_columns(sys.stdout), None
+    if columns is not None and not run.has_page and run.out.suffix.lower() in VIEWED:
+        # ./ before a path that begins with a dash shows that the path is not an option
+        paths = [f"./{path}" if str(path)[0] == "-" else str(path) for path in (run.scene, run.out)]
+        next_step = shlex.join(["gsmerge", "view", *paths])
     lines = result_table(document, next_step, columns=columns)
     print_document(document, lines, as_json=run.json, quiet=run.quiet, wrap=False)
-
-
-def _view_command(scene: Path, out: Path) -> str | None:
-    """Return the command that compares a scene with its result on a page; None if a page cannot show the format."""
-    from gsmerge.io.formats.table import VIEWED
-
-    if out.suffix.lower() not in VIEWED:
-        return None
-    # ./ before a path that begins with a dash shows that the path is not an option
-    paths = [f"./{path}" if str(path)[0] == "-" else str(path) for path in (scene, out)]
-    return shlex.join(["gsmerge", "view", *paths])
-
-
-def _judge_result(document: Mapping[str, Any], run: Run) -> None:
-    """Warn of a result that is worse than its input; TargetError for a missed target or, with ``--strict``, a doubt."""
     psnr, worse, keeps_fidelity = document["psnr_input_views"], document["worse"], "fidelity" in document["choices"]
     if run.strict and not (worse or keeps_fidelity) and psnr["before"] is None:
         say_notes(["--strict: nothing was checked, since there is no photo to compare with"], quiet=run.silent)
@@ -219,21 +192,17 @@ def _judge_result(document: Mapping[str, Any], run: Run) -> None:
         raise TargetError("; ".join(filter(None, problems)))
 
 
-def _refuse_options(context: typer.Context, path: Path) -> None:
-    """Raise UsageError for an option that does not apply to the Feature Gaussians in ``path``."""
+def _decode_features(context: typer.Context, path: Path, given: opt.Given, run: Run) -> None:
+    """Decode the Feature Gaussians of a ``.gsm``, and write the result; UsageError for an option that needs a scene."""
+    from gsmerge.jobs.states.files import decode_file, decoding_line
+    from gsmerge.results.outputs import name_outputs
+    from gsmerge.settings.stages import DecodeOptions
+
     for name, value in context.params.items():
         if value not in (None, False, [], ()) and name not in FEATURE_OPTIONS:
             flag = f"--{name.replace('_', '-')}"
             problem = f"expected a scene with it, but {path} holds Feature Gaussians; their number is set by --k"
             raise UsageError(f"{flag}: {problem}")
-
-
-def _decode_features(path: Path, given: opt.Given, run: Run) -> None:
-    """Decode the Feature Gaussians of a ``.gsm``, and write the result."""
-    from gsmerge.jobs.states.files import decode_file, decoding_line
-    from gsmerge.results.outputs import name_outputs
-    from gsmerge.settings.stages import DecodeOptions
-
     decoding, writing = given.make(DecodeOptions, FileOptions, columns="needed")
     outputs = name_outputs(run.out, writing, overwrite=run.overwrite)
     check_outputs(outputs.paths, (path,), overwrite=run.overwrite or run.dry_run)
@@ -259,48 +228,27 @@ def _find_features(scenes: Sequence[Path]) -> Path | None:
 
 
 def _find_files(scenes: Sequence[Path], output: Path | None, cameras: Any, **named: Any) -> "SceneFiles":
-    """Find the files of a scene, and of further scenes to join with it: those named, or those beside each scene."""
+    """Find the files of a scene, and of further scenes to join with it: those named, or those beside each scene.
+
+    Raises UsageError for several scenes if ``--cameras`` names one file for all, or if a scene is missing, given twice,
+    or a result.
+    """
+    from gsmerge.io.formats.ply import header_content
     from gsmerge.reading.scene_files import find_scene_files
 
-    if len(scenes) > 1:
-        _check_scenes(scenes, output, cameras)
-    files, *more = (find_scene_files(path, cameras=cameras, **named) for path in scenes)
-    return replace(files, more=tuple(more))
-
-
-def _check_scenes(scenes: Sequence[Path], output: Path | None, cameras: Path | str | None) -> None:
-    """Raise UsageError if several scenes cannot be joined.
-
-    Scenes cannot be joined if ``--cameras`` names one file for all, or if a scene is missing, given twice, or a result.
-    """
-    if cameras not in (None, NONE):
+    if len(scenes) > 1 and cameras not in (None, NONE):
         problem = "--cameras: expected one scene with it, got several"
         raise UsageError(f"{problem}; the cameras of several scenes are read from beside or inside them")
-    from gsmerge.io.formats.ply import header_content
-
     remedy = "" if output else "; name the output with -o"
-    for i, scene in enumerate(scenes):
+    for i, scene in enumerate(scenes if len(scenes) > 1 else ()):
         if not os.path.lexists(scene):
             raise UsageError(f"{scene}: no such scene{remedy}")
         if any(os.path.realpath(scene) == os.path.realpath(other) for other in scenes[:i]):
             raise UsageError(f"{scene}: expected each scene once, got it twice{remedy}")
         if scene.is_file() and header_content(scene) == "result":
             raise UsageError(f"{scene}: expected scenes to join, found a result of gsmerge{remedy}")
-
-
-def _warn_of_memory(files: "SceneFiles", settings: CompactOptions, *, quiet: bool) -> None:
-    """Warn before reading if the scene, or the largest of its blocks, is not likely to fit into memory."""
-    from gsmerge.io.formats.table import estimate_counts
-    from gsmerge.plan import wanted_blocks
-    from gsmerge.runtime.memory import memory_bytes, memory_problem
-    from gsmerge.special.blocks.partition import gaussians_at_once
-
-    count, num_rest = estimate_counts([ply for scene_files in (files, *files.more) for ply in scene_files.plys])
-    at_once = gaussians_at_once(count, wanted_blocks(settings, count))
-    needed = memory_bytes(at_once, num_rest=num_rest, num_elsewhere=count - at_once)
-    problem = memory_problem(needed)
-    if problem is not None:
-        say(problem, kind="warning", quiet=quiet)
+    files, *more = (find_scene_files(path, cameras=cameras, **named) for path in scenes)
+    return replace(files, more=tuple(more))
 
 
 def print_estimate(

@@ -13,11 +13,6 @@ if TYPE_CHECKING:
     from gsmerge.reading.scene_files import SceneFiles
 
 
-def default_output(ply: Path) -> Path:
-    """Return the default path of a result: ``scene.ply`` -> ``scene.compact.ply`` beside it."""
-    return ply.with_name(f"{ply.stem}.compact.ply")
-
-
 def output_file(output: Path, name: str) -> Path:
     """Return the file to write: ``output`` itself or, if it is a folder, the file ``name`` in it.
 

@@ -90,13 +90,6 @@ class Command(TyperCommand):
         """List the parts of the usage line after the name of the command."""
         return [*(str(param.metavar) for param in self.params if param.param_type_name == "argument"), "[OPTIONS]"]
 
-    def invoke(self, ctx: Any) -> Any:
-        """Run the command."""
-        from gsmerge.runtime.memory import keep_memory
-
-        keep_memory()
-        return super().invoke(ctx)
-
 
 def usage_message(error: Any) -> str:
     """Describe wrong usage in one line, with a correction if one is known."""

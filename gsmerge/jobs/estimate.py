@@ -18,7 +18,9 @@ from gsmerge.plan import (
     FIDELITY_PSNR,
     TRIAL_SHARE,
     choose_blocks,
+    is_without_views,
     load_networks,
+    note_ignored,
     plan_scene,
     resolve_budget,
     usual_builds,
@@ -28,7 +30,7 @@ from gsmerge.prepare.crop import crop_scene
 from gsmerge.prepare.prepare_scene import views_notes, without_repeats
 from gsmerge.prepare.scene_size import measure_size
 from gsmerge.reading.read_scene import Loaded
-from gsmerge.results.outputs import Outputs, with_output_name
+from gsmerge.results.outputs import Outputs
 from gsmerge.road import compact_scene
 from gsmerge.runtime.documents import document_head, note_entries, note_lines
 from gsmerge.runtime.memory import human_bytes, memory_bytes, memory_problem
@@ -38,7 +40,7 @@ from gsmerge.scoring.coverage import shares_inside
 from gsmerge.settings.compact import OURS, CompactOptions
 from gsmerge.special.blocks.partition import gaussians_at_once
 from gsmerge.special.curve import curve_counts
-from gsmerge.special.methods import choose_method, is_without_views
+from gsmerge.special.methods import choose_method
 from gsmerge.stages.counts import level_counts
 from gsmerge.types import Scene
 
@@ -198,13 +200,15 @@ def estimate_lines(run: Mapping[str, Any]) -> list[str]:
 
 def estimate_files(load: Loaded, settings: CompactOptions, outputs: Outputs) -> dict[str, Any]:
     """Return the document of ``--dry-run``: what :func:`gsmerge.road.compact_files` would make."""
-    scene, out, settings = load.scene, outputs.result, with_output_name(settings, outputs)
+    scene, out = load.scene, outputs.result
     notes = [*load.notes, *views_notes(scene)]
     if os.path.lexists(out) and not outputs.overwrite:
         notes.append(f"{out} exists already: --overwrite would replace it")
     with record_run() as record:
-        choose_method(settings, scene)  # for its notes and errors
-        if settings.method == OURS and settings.checkpoint != "auto":  # raises the errors of a named checkpoint
+        note_ignored(scene, settings)
+        if settings.method != OURS:
+            choose_method(settings, scene)  # for its notes and errors
+        elif settings.checkpoint != "auto":  # raises the errors of a named checkpoint
             load_networks(settings, measure_size(scene))
         run = estimate(scene, settings)
     paths = {name: path and str(path) for name, path in vars(load.files).items() if name in BESIDE}

@@ -16,9 +16,10 @@ from gsmerge.io.cameras.read_cameras import read_cameras
 from gsmerge.io.cameras.viewer_cameras import is_own_settings, viewer_cameras, viewer_cameras_path, viewer_settings
 from gsmerge.io.formats.table import TILESET, Contents, Format, output_format
 from gsmerge.prepare.place_cameras import place_viewpoints
-from gsmerge.settings.compact import CompactOptions
+from gsmerge.settings.compact import OURS, CompactOptions
 from gsmerge.settings.files import FileOptions
 from gsmerge.settings.placement import AXES
+from gsmerge.stages.counts import STREAMED_LEVELS
 from gsmerge.types import Cameras, Gaussians, Scene
 
 # Two cameras are the same if their viewmats and Ks differ by rounding alone. Viewmats may differ by this share of the
@@ -70,9 +71,24 @@ def pad_harmonics(gaussians: Gaussians, count: int) -> Gaussians:
     return replace(gaussians, shN=np.pad(gaussians.shN, ((0, 0), (0, missing), (0, 0))))
 
 
-def with_output_name(settings: CompactOptions, outputs: Outputs) -> CompactOptions:
-    """Return the settings with the name of the output file, because a budget may count the bytes of this file."""
-    return replace(settings, budget=replace(settings.budget, output=outputs.result.name))
+def settings_for(outputs: Outputs, settings: CompactOptions, *, has_levels: bool = True) -> CompactOptions:
+    """Return the settings of a run with the name of its output, because a budget may count the bytes of this file.
+
+    If ``has_levels`` is false, the format of the output chooses the number of levels. Raises UsageError if there are
+    several levels, or a budget in bytes, and the format cannot have these.
+    """
+    out, format_ = outputs.result, outputs.format
+    if format_.levels == "inside" and settings.method == OURS and not has_levels:
+        settings = settings.with_settings({"levels": STREAMED_LEVELS})
+    budget = settings.budget
+    if not format_.levels and budget.levels > 1:
+        kind = format_.about.partition(":")[0]
+        raise UsageError(f"{out}: expected one level in {kind}, found --levels {budget.levels}; drop --levels")
+    if budget.in_bytes and not format_.gaussian_bytes:
+        raise UsageError(f"{out}: expected a --budget in Gaussians for this format, got {budget.budget}")
+    if budget.in_bytes and outputs.options.columns == "full":
+        raise UsageError(f"columns full: expected a --budget that is a number or a share, got {budget.budget}")
+    return replace(settings, budget=replace(budget, output=out.name))
 
 
 def list_first_layers(scene: Scene) -> list[int]:

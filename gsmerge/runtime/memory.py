@@ -17,10 +17,6 @@ import numpy as np
 
 # Files with the memory limit of a control group, version 2 and version 1
 LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
-# Parameters of glibc with their values, see mallopt(3). An array of 32 MiB or more gets separate pages, which return to
-# the system when the array is deleted. The process keeps up to 256 MiB of the memory of deleted smaller arrays for new
-# arrays. With glibc's default values, the system clears new pages for each array, a tenth of the time of `view`
-M_MMAP_THRESHOLD, M_TRIM_THRESHOLD = (-3, 1 << 25), (-1, 1 << 28)
 MAPPED_BYTES = 1 << 28  # arrays of this size or more are mapped from files
 # Bytes of memory that a run needs
 BYTES_FIXED = 250_000_000  # for the interpreter and the libraries
@@ -100,17 +96,6 @@ def memory_problem(needed: int, remedy: str = FEWER_PIXELS) -> str | None:
     if available is None or needed <= available:
         return None
     return f"about {needed / 1e9:.1f} GB of memory are needed, and this machine has {available / 1e9:.1f} GB; {remedy}"
-
-
-def keep_memory() -> None:
-    """Let new arrays reuse the memory of deleted arrays, if the C library can.
-
-    The process then keeps more memory than it uses, so only processes that do a single job call this function.
-    """
-    with suppress(AttributeError, OSError, TypeError):  # not glibc
-        mallopt = ctypes.CDLL(None).mallopt
-        for parameter, value in (M_MMAP_THRESHOLD, M_TRIM_THRESHOLD):
-            mallopt(parameter, value)
 
 
 def release_memory() -> None:

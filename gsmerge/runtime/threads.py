@@ -148,7 +148,11 @@ def use_threads(count: int | None = None) -> Iterator[int]:
         yield _local.count
         return
     count = available_threads() if count is None else count
-    _hold_opencv()
+    with _libraries.lock:
+        if _libraries.pools == 0:
+            _libraries.opencv = cv2.getNumThreads()
+        _libraries.pools += 1
+        cv2.setNumThreads(1)
     _local.pool = _Pool(count - 1)
     _local.count = count
     hold_torch()
@@ -157,16 +161,14 @@ def use_threads(count: int | None = None) -> Iterator[int]:
     finally:
         _local.pool.shutdown()
         _local.pool, _local.count = None, 1
-        _release_libraries()
-
-
-def _hold_opencv() -> None:
-    """Limit OpenCV to one thread, and count one more pool in use."""
-    with _libraries.lock:
-        if _libraries.pools == 0:
-            _libraries.opencv = cv2.getNumThreads()
-        _libraries.pools += 1
-        cv2.setNumThreads(1)
+        with _libraries.lock:  # torch is as before if this pool limited it, and OpenCV after the last pool
+            _libraries.pools -= 1
+            if _local.holds_torch:
+                sys.modules["torch"].set_num_threads(_libraries.torch)
+                _local.holds_torch = False
+            if _libraries.pools == 0:
+                cv2.setNumThreads(_libraries.opencv)
+                _libraries.torch = None
 
 
 def hold_torch() -> None:
@@ -185,29 +187,52 @@ def hold_torch() -> None:
         _local.holds_torch = True
 
 
-def _release_libraries() -> None:
-    """Count one pool less; restore torch's threads if this pool limited torch, and OpenCV's after the last pool."""
-    with _libraries.lock:
-        _libraries.pools -= 1
-        if _local.holds_torch:
-            sys.modules["torch"].set_num_threads(_libraries.torch)
-            _local.holds_torch = False
-        if _libraries.pools == 0:
-            cv2.setNumThreads(_libraries.opencv)
-            _libraries.torch = None
-
-
 def parallel_map(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
     """Return ``[function(item) for item in items]``, computed on the pool, in the order of the items.
 
     Outside of :func:`use_threads`, a pool with all processors is made for the call. If ``function`` itself calls
-    :func:`parallel_map`, the inner call computes its items one by one. The calling thread computes items as well.
+    :func:`parallel_map`, the inner call computes its items one by one. The calling thread computes items as well, and a
+    free thread takes the next item. The call does not wait for threads that took no item. After an error, a thread
+    takes further items without computing them. If several items fail, the error of the first failed item is raised,
+    even if another thread failed earlier.
     """
     items = list(items)
     with use_threads() as count:
         if count == 1 or len(items) < 2 or _local.pool is None or _local.inside:
             return [function(item) for item in items]
-        return _compute_on_pool(_local.pool, function, items, min(count, len(items)) - 1)
+        results: list[R] = [None] * len(items)  # type: ignore[list-item]
+        indices = itertools.count()  # its next() is atomic
+        errors: dict[int, BaseException] = {}  # by index of the item
+        counts: SimpleQueue[int] = SimpleQueue()  # number of items that each thread took
+
+        def work() -> None:
+            """Take items and compute them until no item is left, and then report how many items were taken."""
+            num_taken, has_failed = 0, False
+            for index in indices:
+                if index >= len(items):
+                    break
+                num_taken += 1
+                try:
+                    if not has_failed:
+                        results[index] = function(items[index])
+                except BaseException as error:
+                    errors[index], has_failed = error, True
+            if num_taken:
+                counts.put(num_taken)
+
+        for _ in range(min(count, len(items)) - 1):
+            _local.pool.work.put(work)
+        _local.inside = True
+        try:
+            work()
+        finally:
+            _local.inside = False
+        num_left = len(items)
+        while num_left:
+            num_left -= counts.get()
+        if errors:
+            raise errors.pop(min(errors))
+        return results
 
 
 def in_turn(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
@@ -218,44 +243,3 @@ def in_turn(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
     items = list(items)
     for start in range(0, len(items), AT_ONCE):
         yield from parallel_map(function, items[start : start + AT_ONCE])
-
-
-def _compute_on_pool(pool: _Pool, function: Callable[[T], R], items: list[T], num_helpers: int) -> list[R]:
-    """Compute the items on this thread and on ``num_helpers`` threads of the pool; a free thread takes the next item.
-
-    The call does not wait for threads that took no item. After an error, a thread takes further items without computing
-    them. If several items fail, the error of the first failed item is raised, even if another thread failed earlier.
-    """
-    results: list[R] = [None] * len(items)  # type: ignore[list-item]
-    indices = itertools.count()  # its next() is atomic
-    errors: dict[int, BaseException] = {}  # by index of the item
-    counts: SimpleQueue[int] = SimpleQueue()  # number of items that each thread took
-
-    def work() -> None:
-        """Take items and compute them until no item is left, and then report how many items were taken."""
-        num_taken, has_failed = 0, False
-        for index in indices:
-            if index >= len(items):
-                break
-            num_taken += 1
-            try:
-                if not has_failed:
-                    results[index] = function(items[index])
-            except BaseException as error:
-                errors[index], has_failed = error, True
-        if num_taken:
-            counts.put(num_taken)
-
-    for _ in range(num_helpers):
-        pool.work.put(work)
-    _local.inside = True
-    try:
-        work()
-    finally:
-        _local.inside = False
-    num_left = len(items)
-    while num_left:
-        num_left -= counts.get()
-    if errors:
-        raise errors.pop(min(errors))
-    return results

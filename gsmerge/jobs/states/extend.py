@@ -12,18 +12,16 @@ from gsmerge.errors import SceneError, split_notes
 from gsmerge.geometry.transforms import camera_centres, camera_distances
 from gsmerge.geometry.views import camera_kinds, concat_cameras, in_float64, resize_cameras, subset
 from gsmerge.io.photo_files import photo_array
-from gsmerge.plan import make_plan
 from gsmerge.prepare.confirm_depths import CHANCE_ERRORS, NORMAL_SAMPLES
 from gsmerge.prepare.prepare_scene import Prepared
 from gsmerge.raster.photos import shrink_pictures
 from gsmerge.reading.alignment import check_cameras
 from gsmerge.results.outputs import pad_harmonics
-from gsmerge.road import compact_prepared
+from gsmerge.road import compact_prepared, plan_run
 from gsmerge.runtime.record import Progress, record_run
 from gsmerge.runtime.threads import use_threads
 from gsmerge.settings.compact import ONE_PIECE, CompactOptions
 from gsmerge.settings.extend import ExtendOptions
-from gsmerge.special.methods import choose_method
 from gsmerge.types import Cameras, Gaussians, Scene
 
 # A "world" is a frame of coordinates. The colours of the earlier Gaussians in front are compared with the new pictures
@@ -81,15 +79,14 @@ def extend(
     """
     options = options.with_settings(ONE_PIECE)
     with use_threads(options.threads), record_run(progress):
-        method = choose_method(options, scene)
-        prepared = method.prepare(scene.numpy(), options.prepare)
+        prepared, plan = plan_run(scene, options)
         batch_views = _keep_pictures(prepared)
         world, parts = UNKNOWN_WORLD, []
         if before is not None:
             world = compare_worlds(before.gaussians, batch_views, prepared.input_scene.gaussians.means)
             refuse_other_world(world, extend_options)
             parts = [before.gaussians]
-        result = compact_prepared(prepared, make_plan(prepared, options, run=method.run))
+        result = compact_prepared(prepared, plan)
     notes = split_notes(result.report.notes, "worse")[1]  # only of a final result is it said that it is worse
     notes += [NOT_COMPARED] if before is not None and world == UNKNOWN_WORLD else []
     parts.append(result.gaussians.numpy())

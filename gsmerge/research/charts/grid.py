@@ -61,7 +61,7 @@ def list_settings(grid: SettingGrid, fixed: Mapping[str, Any]) -> list[tuple[str
     others = {name: values for name, values in grid.items() if name not in (*SIZE_SETTINGS, "method")}
     runs: dict[str, tuple[str, dict[str, Any]]] = {INPUT: (INPUT, {})}
     for method in grid.get("method", (OURS,)):
-        used = None if method == OURS else (*find_method(options_of(method, {})).uses, *COMMON_SETTINGS)
+        used = None if method == OURS else (*find_method(options_of(method, {}).method).uses, *COMMON_SETTINGS)
         for size, *values in product(sizes, *others.values()):
             chosen = {**size, **dict(zip(others, values, strict=True))}
             chosen |= {name: value for name, value in fixed.items() if name not in chosen}

@@ -13,10 +13,10 @@ from messages import noted
 from gsmerge import CompactOptions, Gaussians, Scene, compact, render
 from gsmerge.fit import FitOptions, fit_scene
 from gsmerge.geometry.transforms import project
+from gsmerge.plan import is_without_views
 from gsmerge.prepare.place_cameras import HELD_OUT, place_viewpoints
 from gsmerge.prepare.prepare_scene import Prepared, prepare
 from gsmerge.runtime.record import record_run
-from gsmerge.special.methods import is_without_views
 from gsmerge.stages.fit_pairs import merge_scene
 
 

@@ -8,7 +8,8 @@ import scenes
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gsmerge.plan import usual_blocks
+from gsmerge import CompactOptions
+from gsmerge.plan import wanted_blocks
 from gsmerge.special.blocks.partition import (
     SHARED,
     Block,
@@ -80,7 +81,7 @@ def test_views_of_one_room_stay_together(rooms: int, asked: int, expected: int) 
     [(19_000_000, 60, 1), (19_000_000, 168, 1), (4_838_400, 252, 6), (19_200_000, 1000, 24), (21_000_000, 20, 3)],
 )
 def test_many_gaussians_or_views_ask_for_blocks(num_gaussians: int, num_views: int, blocks: int) -> None:
-    assert usual_blocks(num_gaussians, num_views) == blocks
+    assert wanted_blocks(CompactOptions(), num_gaussians, num_views) == blocks
 
 
 @pytest.fixture(scope="module")
