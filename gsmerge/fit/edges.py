@@ -18,8 +18,7 @@ from gsmerge.fit.growth import OFFSET, fade_halves
 from gsmerge.geometry.pooling import principal_axes
 from gsmerge.geometry.transforms import camera_centres, camera_depths, covariances
 from gsmerge.kernels.elementary import exp, log
-from gsmerge.kernels.gaussians.edges import cut_at_edges
-from gsmerge.kernels.gaussians.optimise import LOGIT, QUAT, SIZE
+from gsmerge.kernels.gaussians.optimise import LOGIT, QUAT, SIZE, cut_at_edges
 from gsmerge.kernels.matrices import matmul
 from gsmerge.raster import Splats
 from gsmerge.runtime.threads import parallel_map

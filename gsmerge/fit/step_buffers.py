@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from gsmerge.fit.fit_state import FitState
-from gsmerge.kernels.raster import image_loss
+from gsmerge.kernels.raster import step as kernels
 from gsmerge.kernels.raster.project import BLOCK, CAMERA, CONIC, POSE, SUMS, TILE
 from gsmerge.kernels.raster.step import PHASES, STEP, THREAD_GAUSSIANS, fit_phase
 from gsmerge.kernels.signature import FilledTable
@@ -103,7 +103,7 @@ class StepBuffers:
         """Return the table for photos of this size, with the addresses of photo, weights and drawn opacities."""
         of_step = {"photo": photo, "weight": weight, "drawn": drawn}
         if weight.shape not in self.tables:
-            table = STEP.fill(self.gaussians | self.room | self._pixel_buffers(*weight.shape) | of_step)
+            table = FilledTable(STEP, self.gaussians | self.room | self._pixel_buffers(*weight.shape) | of_step)
             calls = [fit_phase.prepare(table.values, phase) for phase in range(len(PHASES))]
             self.tables[weight.shape] = table, calls
         table = self.tables[weight.shape][0]
@@ -113,12 +113,12 @@ class StepBuffers:
 
     def _pixel_buffers(self, height: int, width: int) -> dict[str, np.ndarray]:
         """Allocate the arrays of a table that depend on the size of the photo, by name."""
-        columns, lines, line = -(-width // TILE), -(-height // TILE), image_loss.room_of(width)
+        columns, lines, line = -(-width // TILE), -(-height // TILE), kernels.room_of(width)
         spans, tiles, corners = 2 * self.threads, columns * lines, (columns + 1) * (lines + 1)
         shapes: dict[str, tuple[int, ...]] = {
             "image": (height, width, 3), "gradient": (height, width, 3), "transmittance": (height, width),
-            "errors": (height,), "terms": (self.threads, image_loss.DERIVATIVE_ROWS, image_loss.TERMS, line),
-            "rows": (self.threads, image_loss.EDGE_ROWS, line), "light": (tiles,),
+            "errors": (height,), "terms": (self.threads, kernels.DERIVATIVE_ROWS, kernels.TERMS, line),
+            "rows": (self.threads, kernels.EDGE_ROWS, line), "light": (tiles,),
         }  # fmt: skip
         counts = {"corners": (spans, corners), "counts": (spans, tiles), "offsets": (tiles + 1,)}
         pictures = {name: np.empty(shape, np.float32) for name, shape in shapes.items()}

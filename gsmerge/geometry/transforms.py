@@ -16,7 +16,7 @@ from gsmerge.arrays import Array
 from gsmerge.kernels.elementary import arctan2, cos, sin
 from gsmerge.kernels.gaussians.cross_view import make_tree, nearest_of_others
 from gsmerge.kernels.matrices import closest_rotation, invert, matmul, solve
-from gsmerge.kernels.raster.sh import view_colors
+from gsmerge.kernels.raster.project import view_colors
 from gsmerge.runtime.threads import parallel_map, use_threads
 from gsmerge.types import SH_C0, Cameras, Gaussians, Region, SceneT
 

@@ -111,27 +111,21 @@ def enlarge(picture: Picture, width: int, height: int, *, periodic: bool = False
     """
     out: Picture = np.asarray(picture, np.float32)
     for axis, size in ((0, height), (1, width)):
-        columns, weights = _cubic_taps(out.shape[axis], size)
-        ids = columns % out.shape[axis] if periodic else columns.clip(0, out.shape[axis] - 1)
+        old = out.shape[axis]
+        centres = (np.arange(size) + 0.5) * (old / size) - 0.5  # centres of the new pixels, in old pixels
+        # The four old pixels around each new pixel, and their weights. At the ends of a line, indices may be below 0 or
+        # above the last pixel
+        floors, taps = np.floor(centres).astype(np.int64), np.arange(-1, 3)[:, None]
+        distances = np.abs(centres - floors - taps)
+        a = -0.75  # slope parameter of the cubic convolution (Keys 1981), the same as in OpenCV
+        inner = ((a + 2) * distances - (a + 3)) * distances * distances + 1
+        outer = ((a * distances - 5 * a) * distances + 8 * a) * distances - 4 * a
+        weights = np.where(distances <= 1, inner, outer).astype(np.float32)
+        ids = (floors + taps) % old if periodic else (floors + taps).clip(0, old - 1)
         shape = [-1 if i == axis else 1 for i in range(out.ndim)]
         terms = [out.take(tap, axis) * weight.reshape(shape) for tap, weight in zip(ids, weights, strict=True)]
         out = terms[0] + terms[1] + terms[2] + terms[3]
     return out
-
-
-def _cubic_taps(old: int, new: int) -> tuple[Picture, Picture]:
-    """Return the indices ``[4,new]`` of the four old pixels around each new pixel, and their weights ``[4,new]``.
-
-    A line of ``old`` pixels is enlarged to ``new`` pixels. At the ends of the line, indices may be below 0 or above the
-    last pixel.
-    """
-    centres = (np.arange(new) + 0.5) * (old / new) - 0.5  # centres of the new pixels, in old pixels
-    floors, taps = np.floor(centres).astype(np.int64), np.arange(-1, 3)[:, None]
-    distances = np.abs(centres - floors - taps)
-    a = -0.75  # slope parameter of the cubic convolution (Keys 1981), the same as in OpenCV
-    inner = ((a + 2) * distances - (a + 3)) * distances * distances + 1
-    outer = ((a * distances - 5 * a) * distances + 8 * a) * distances - 4 * a
-    return floors + taps, np.where(distances <= 1, inner, outer).astype(np.float32)
 
 
 def turn_picture(picture: Picture, orientation: int) -> Picture:

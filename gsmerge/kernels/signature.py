@@ -181,16 +181,12 @@ class Table:
         self.name, self.arrays = name, arrays
         self.fields = {key: i for i, key in enumerate((*arrays, *size_names(arrays), *numbers))}
 
-    def fill(self, arrays: dict[str, np.ndarray[Any, Any]]) -> FilledTable:
-        """Check ``arrays``, and return a struct with their addresses and sizes, and with zeros as numbers."""
-        return FilledTable(self, arrays)
-
 
 class FilledTable:
     """A struct that a :class:`Table` declares. The struct keeps its arrays in memory."""
 
     def __init__(self, table: Table, arrays: dict[str, np.ndarray[Any, Any]]) -> None:
-        """Check the arrays, and write their addresses and sizes to ``values``."""
+        """Check the arrays, write their addresses and sizes to ``values``, and set the numbers to zero."""
         self.table, self.arrays, self._sizes = table, dict[str, np.ndarray[Any, Any]](), dict[str, int]()
         self.values = np.zeros(len(table.fields), np.int64)
         for key in table.arrays:

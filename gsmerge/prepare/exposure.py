@@ -20,9 +20,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gsmerge.geometry.transforms import camera_distances, correlation, medians, order_others, rgb_to_sh0, sh0_to_rgb
-from gsmerge.kernels.compare_views import find_surfaces
 from gsmerge.kernels.elementary import exp, log
 from gsmerge.kernels.matrices import solve
+from gsmerge.kernels.reproject import find_surfaces
 from gsmerge.prepare.photo_change import CLIPPED, PhotoChange, change_large
 from gsmerge.raster.photos import NEAR_PLANE
 from gsmerge.runtime.record import note, record_choices

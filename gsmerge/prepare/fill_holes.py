@@ -15,9 +15,9 @@ import cv2
 import numpy as np
 
 from gsmerge.geometry.transforms import lies_inside, nearest_views, rgb_to_sh0
-from gsmerge.kernels.compare_views import add_differences
 from gsmerge.kernels.matrices import invert, matmul
 from gsmerge.kernels.pictures import blur
+from gsmerge.kernels.reproject import add_differences
 from gsmerge.prepare.photo_change import PhotoChange, change_large
 from gsmerge.prepare.row_colors import fill_gaps
 from gsmerge.raster import TiledView

@@ -27,11 +27,10 @@ from gsmerge.geometry.transforms import (
     move_views,
     without_common_motion,
 )
-from gsmerge.kernels.compare_views import SCRATCH_COLUMNS, compare_views
 from gsmerge.kernels.matrices import invert, matmul, solve
 from gsmerge.kernels.pictures import blur
-from gsmerge.kernels.raster.sh import view_colors
-from gsmerge.kernels.reproject import see_points
+from gsmerge.kernels.raster.project import view_colors
+from gsmerge.kernels.reproject import SCRATCH_COLUMNS, compare_views, see_points
 from gsmerge.raster.photos import NEAR_PLANE, photos_of
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import PicturedScene

@@ -19,7 +19,8 @@ import numpy as np
 
 from gsmerge.geometry.pooling import measure_pixel_sizes
 from gsmerge.geometry.transforms import find_nearest
-from gsmerge.kernels.gaussians.fronts import order_by_depth, project_centres, weigh_centres
+from gsmerge.kernels.gaussians.fronts import project_centres, weigh_centres
+from gsmerge.kernels.raster.binning import depth_order
 from gsmerge.raster.images import ONE_AT_A_TIME
 from gsmerge.raster.photos import NEAR_PLANE
 from gsmerge.raster.tiled_view import EPS2D
@@ -122,7 +123,7 @@ def _weigh_view(
         shown, SHOWN_WIDTH * float(np.sqrt(np.median(np.abs(areas[:: max(1, len(areas) // ESTIMATE_GAUSSIANS)]))))
     )
     # first the fronts of all cells, then the fronts of pixels from the Gaussians on the surface of their cell
-    order, (cells, shape) = order_by_depth(depths), _cells_of(pixels, fronts.shape, level)
+    order, (cells, shape) = depth_order(depths), _cells_of(pixels, fronts.shape, level)
     grid_fronts = np.empty(shape, np.int32)
     weights = weigh_centres(order, ids, cells, areas, opacities, grid_fronts)  # fills `grid_fronts`
     cell_fronts = grid_fronts.reshape(-1)

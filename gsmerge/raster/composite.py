@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from gsmerge.arrays import Array as AnyArray
 from gsmerge.arrays import ArrayFields, as_array
 from gsmerge.kernels.raster import blend as kernels
-from gsmerge.kernels.raster import sh
+from gsmerge.kernels.raster import project as projection
 from gsmerge.raster.tiled_view import Array, Splats, TiledView, make_splats, pieces, tile_ranges
 from gsmerge.runtime.threads import parallel_map, use_threads
 from gsmerge.types import Cameras, Gaussians
@@ -31,7 +31,9 @@ def view_colors(tiled: TiledView) -> Array:
     colors, splats = np.empty((len(tiled.ids), 3), np.float32), tiled.splats
     with use_threads() as threads:
         parallel_map(
-            lambda span: sh.view_colors(splats.means, splats.sh0, splats.shN, tiled.ids, tiled.eye, *span, colors),
+            lambda span: projection.view_colors(
+                splats.means, splats.sh0, splats.shN, tiled.ids, tiled.eye, *span, colors
+            ),
             pieces(len(tiled.ids), threads),
         )
     return colors

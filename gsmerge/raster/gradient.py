@@ -11,7 +11,7 @@ from itertools import pairwise
 import numpy as np
 
 from gsmerge.kernels.matrices import matmul
-from gsmerge.kernels.raster import sh
+from gsmerge.kernels.raster import project as projection
 from gsmerge.kernels.raster.blend import blend_backward, gather_slots
 from gsmerge.kernels.raster.project import BLOCK, POSE, SUMS, project_backward
 from gsmerge.raster.tiled_view import Array, TiledView, pieces, tile_ranges
@@ -132,7 +132,7 @@ def color_gradients(
         sh0, shN, means = (np.empty((m, *shape), np.float32) for shape in ((1, 3), shape_N, (3,)))
     with use_threads() as threads:
         parallel_map(
-            lambda span: sh.view_colors_backward(
+            lambda span: projection.view_colors_backward(
                 splats.means, splats.shN, tiled.ids, tiled.eye, *span, colors, grad_colors, sh0, shN, means
             ),
             pieces(m, threads),

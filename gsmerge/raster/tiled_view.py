@@ -333,7 +333,7 @@ def tile_view(
         if is_part:
             boxes[:, :2] = boxes[:, :2].clip(left, right)
             boxes[:, 2:] = boxes[:, 2:].clip(top, bottom)
-        order = depth_order(depths.view(np.uint32))
+        order = depth_order(depths)
         wanted = np.ones((tile_height, tile_width), bool) if tiles is None else tiles
         flatten_ids, isect_offsets = _list_by_tile(order, boxes, conics, wanted, threads)
     eye, first_row = camera_centres(local_viewmat).astype(np.float32), top * projection.TILE

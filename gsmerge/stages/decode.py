@@ -9,7 +9,7 @@ import numpy as np
 
 from gsmerge.arrays import as_array
 from gsmerge.geometry.pooling import Members, feature_to_gaussians, pool_members, to_gaussians
-from gsmerge.kernels.gaussians.bisect import bisect, gather_groups, split_errors
+from gsmerge.kernels.gaussians.pool import bisect, gather_groups, split_errors
 from gsmerge.networks.corrector import ANALYTIC, Corrector
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map

@@ -16,9 +16,9 @@ import numpy as np
 
 from gsmerge.geometry.transforms import correlation, is_inside, project
 from gsmerge.kernels.pictures import blur, sobel
+from gsmerge.kernels.raster.list_weights import LANES, collect, list_weights
 from gsmerge.raster import make_splats, tile_view
 from gsmerge.raster.photos import NEAR_PLANE
-from gsmerge.raster.weights import apply_transposed, view_weights
 from gsmerge.types import Cameras, Gaussians
 
 GRADIENT_PIXELS = 480.0  # gradients are measured in a photo with GRADIENT_PIXELS on its longer side
@@ -64,10 +64,13 @@ def _mostly_inside(gaussians: Gaussians, cameras: Cameras, regions: Mapping[int,
     inside, total = np.zeros(len(splats)), np.zeros(len(splats))
     for view, region in regions.items():
         viewmat, K = cameras.viewmats[view].astype(np.float64), cameras.Ks[view].astype(np.float64)
-        weights = view_weights(tile_view(splats, viewmat, K, cameras.width, cameras.height, near=NEAR_PLANE))
-        sums = apply_transposed(weights, np.stack([region, np.ones_like(region)], 2).astype(np.float32))
-        inside[weights.ids] += sums[:, 0]
-        total[weights.ids] += sums[:, 1]
+        tiled = tile_view(splats, viewmat, K, cameras.width, cameras.height, near=NEAR_PLANE)
+        image = np.zeros((*region.shape, LANES), np.float32)
+        image[..., 0], image[..., 1] = region, 1
+        sums = np.zeros((len(tiled.ids), LANES))  # of each Gaussian's weights times the channels of the image
+        collect(*list_weights(*tiled.lists, tiled.height, tiled.width), *tiled.lists[1:], image, sums)
+        inside[tiled.ids] += sums[:, 0]
+        total[tiled.ids] += sums[:, 1]
     min_share = 0.7  # least share of the blending weight of a Gaussian that lies inside
     return np.asarray((inside > 0) & (inside >= min_share * total))
 

@@ -17,15 +17,15 @@ import cv2
 import numpy as np
 
 from gsmerge.arrays import Array, as_array, like
-from gsmerge.kernels.superpixels.kd import split_rectangles
-from gsmerge.kernels.superpixels.regions import pad_labels, refine
-from gsmerge.kernels.superpixels.seeds import (
+from gsmerge.kernels.superpixels.bass import (
     corner_response,
     hexagonal_seeds,
+    infer_labels,
     seed_density,
     seeds_from_density,
     voronoi,
 )
+from gsmerge.kernels.superpixels.regions import pad_labels, refine, split_rectangles
 from gsmerge.kernels.superpixels.ward import merge_regions
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.stages import SegmentOptions
@@ -176,8 +176,6 @@ def _rdseg(pixels: np.ndarray, count: int, rectangles: float, early_sweeps: int,
 
 def _bass(pixels: np.ndarray, count: int, segmentation: str) -> np.ndarray:
     """Cut an image by BASS, and return padded labels. Seeds are on a hexagonal grid, or drawn by saliency."""
-    from gsmerge.kernels.superpixels.bass import infer_labels
-
     height, width, _ = pixels.shape
     if segmentation == "bass":
         seeds = hexagonal_seeds(height, width, count)

@@ -8,7 +8,7 @@ from gsmerge.fit.fit_state import FitState
 from gsmerge.fit.schedule import Step
 from gsmerge.fit.steps import Optimiser
 from gsmerge.kernels.gaussians.optimise import adam
-from gsmerge.kernels.raster import image_loss
+from gsmerge.kernels.raster import step as step_kernels
 from gsmerge.raster import tile_view
 from gsmerge.raster.composite import blend, view_colors
 from gsmerge.raster.gradient import Gradients, gradients_of
@@ -57,7 +57,7 @@ def differentiate_rows(
     first: int, last: int, gradient: np.ndarray, errors: np.ndarray,
 ) -> None:  # fmt: skip
     """Call the loss kernel on a range of rows of ``[h,3w]`` images, with buffers of its own."""
-    room, weights = image_loss.room_of(weight.shape[1]), (np.float32(ssim_lambda), np.float32(edge_weight))
-    terms = np.empty((image_loss.DERIVATIVE_ROWS, image_loss.TERMS, room), np.float32)
-    rows = np.empty((image_loss.EDGE_ROWS, room), np.float32)
-    image_loss.loss_gradient(image, photo, weight, *weights, first, last, gradient, errors, terms, rows)
+    room, weights = step_kernels.room_of(weight.shape[1]), (np.float32(ssim_lambda), np.float32(edge_weight))
+    terms = np.empty((step_kernels.DERIVATIVE_ROWS, step_kernels.TERMS, room), np.float32)
+    rows = np.empty((step_kernels.EDGE_ROWS, room), np.float32)
+    step_kernels.loss_gradient(image, photo, weight, *weights, first, last, gradient, errors, terms, rows)

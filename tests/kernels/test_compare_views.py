@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from gsmerge.geometry.transforms import camera_depths, motion_matrices, project_points
-from gsmerge.kernels.compare_views import SCRATCH_COLUMNS, add_differences, compare_views, find_surfaces
 from gsmerge.kernels.elementary import log, log1p
 from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.pictures import sample_bilinear
+from gsmerge.kernels.reproject import SCRATCH_COLUMNS, add_differences, compare_views, find_surfaces
 
 NEAR, BORDER, SCALE = 0.1, 2, 3.0
 MIN_SEEN, SAME_DEPTH, DOUBT, MIN_DOUBT, CLEAR = 50, 0.15, 1.5, 0.01, 0.03

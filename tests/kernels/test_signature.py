@@ -6,7 +6,7 @@ from messages import refuses
 
 from gsmerge.kernels.raster.binning import MOST_TILES, count_boxes, deal_tiles, sort_bits
 from gsmerge.kernels.raster.project import CAMERA, cull
-from gsmerge.kernels.signature import Table, f4
+from gsmerge.kernels.signature import FilledTable, Table, f4
 
 
 def arrays(m=3):
@@ -104,7 +104,7 @@ def test_a_prepared_call_works_on_the_arrays_that_it_was_given():
 def test_tables_check_what_they_point_to():
     table = Table("Pair", ("count",), first=f4("n", 2), second=f4("n", out=True))
     arrays = {"first": np.zeros((3, 2), np.float32), "second": np.zeros(3, np.float32)}
-    filled = table.fill(arrays)
+    filled = FilledTable(table, arrays)
     assert filled["n"] == 3
     assert filled["count"] == 0
     assert filled["second"] == arrays["second"].ctypes.data
@@ -113,4 +113,4 @@ def test_tables_check_what_they_point_to():
     with refuses(ValueError, "Pair: second", "n = 3"):
         filled.point("second", np.zeros(4, np.float32))
     with refuses(ValueError, "Pair: second"):
-        table.fill(arrays | {"second": np.zeros(4, np.float32)})
+        FilledTable(table, arrays | {"second": np.zeros(4, np.float32)})

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsmerge.kernels.raster.binning import depth_order
 from gsmerge.kernels.signature import COUNT, STATUS, declare, f4, f8, i4, i8
 
 _project_centres = declare(
@@ -21,11 +20,6 @@ _weigh_centres = declare(
     passing=f4("h", "w", out=True), most=f4("h", "w", out=True), fronts=i4("h", "w", out=True),
     weights=f4("m", out=True),
 )  # fmt: skip
-
-
-def order_by_depth(depths):
-    """Return the order ``[m]`` int32 of ``depths [m]`` float32 above 0, nearest first. Equal depths stay in order."""
-    return depth_order(depths.view(np.uint32))
 
 
 def project_centres(means, scales, viewmat, K, width, height, near):

@@ -1,4 +1,7 @@
-"""Sort members into groups, compute the moments of each group, and turn covariances into scales and rotations."""
+"""Sort members into groups, split groups into children, and compute moments, scales and rotations of groups.
+
+A group is split by halving its members repeatedly across their widest direction.
+"""
 
 from __future__ import annotations
 
@@ -22,6 +25,73 @@ def group_members(labels, count):
     starts, ids = np.empty(count + 1, np.int64), np.empty(len(labels), np.int32)
     _sort_labels(labels, starts, ids)
     return starts, ids[: starts[-1]]
+
+
+# `features` to `room` are work space for the longest group and the most children. `errors` may have no columns
+_split_groups = declare(
+    "split_groups", STATUS, starts=i8("ends", least=0, ascending=True), ids=i4("m"), means=f4("n", 3),
+    sh0=f4("n", 1, 3), opacities=f4("n"), centres=f8("groups", 3), footprints=f8("groups"),
+    counts=i8("groups", least=1), plane_weight=f8(), features=f8("longest", 8, out=True),
+    weights=f8("longest", out=True), order=i8(2, "longest", out=True), cuts=i8("bounds", out=True),
+    room=f8("most", 18, out=True), child_starts=i8("slots", out=True), child_ids=i4("own", out=True),
+    parents=i8("children", out=True), num_children=i8(1, out=True), errors=f8("groups", "width", out=True),
+)  # fmt: skip
+
+
+def gather_groups(starts, ids, rows):
+    """Return the starts ``[r+1]`` and the ids of the members of the groups ``rows [r]``, group after group."""
+    sizes = starts[rows + 1] - starts[rows]
+    row_starts = np.concatenate([[0], np.cumsum(sizes)])
+    return row_starts, ids[np.repeat(starts[rows] - row_starts[:-1], sizes) + np.arange(row_starts[-1])]
+
+
+def bisect(starts, ids, means, sh0, opacities, centres, footprints, num_children):
+    """Divide the members of every group into ``num_children`` children, by halving.
+
+    ``num_children`` is one number for all groups or ``[g]``, at least 1. In each step, the child with the largest
+    spread of features is halved. The features of a member are its colour, and its position relative to ``centres
+    [g,3]`` in units of ``footprints [g]``. A group gives fewer children if members have equal features, because a child
+    of equal members cannot be halved. If a group is halved into two children, they are unions of the four children into
+    which it can be divided.
+
+    Returns the start ``[m+1]`` of each child in a list of members, the list itself, and the group ``[m]`` of each
+    child.
+    """
+    num_groups = len(starts) - 1
+    counts = np.array(np.broadcast_to(num_children, num_groups), np.int64)
+    return _split_into_children(
+        starts, ids, means, sh0, opacities, centres, footprints, counts, np.empty((num_groups, 0)), 0.0
+    )
+
+
+def split_errors(starts, ids, means, sh0, opacities, centres, footprints, max_children, plane_weight):
+    """Return the squared error ``[g,max_children]`` of every group with 1, 2 and more children of :func:`bisect`.
+
+    The error is NaN for more children than a group can have. The error of a group is the weighted sum of the errors of
+    its members. The error of a member is its squared distance from the child's mean colour, plus ``plane_weight`` times
+    its squared distance from a plane through the child, both in features. The mean weight of the members is one, and
+    opaque members weigh more.
+    """
+    num_groups = len(starts) - 1
+    counts, errors = np.full(num_groups, max_children, np.int64), np.full((num_groups, max_children), np.nan)
+    _split_into_children(starts, ids, means, sh0, opacities, centres, footprints, counts, errors, plane_weight)
+    return errors
+
+
+def _split_into_children(starts, ids, means, sh0, opacities, centres, footprints, counts, errors, plane_weight):
+    """Return the result of :func:`bisect`, and write an error for each number of children to ``errors [g, any]``."""
+    sizes = np.diff(starts)
+    counts = np.minimum(counts, np.maximum(sizes, 1))
+    longest, most, total = int(sizes.max(initial=0)), int(counts.max(initial=1)), int(counts.sum())
+    child_starts, parents = np.empty(total + 1, np.int64), np.empty(total, np.int64)
+    child_ids, num_children = np.empty(starts[-1] - starts[0], np.int32), np.empty(1, np.int64)
+    _split_groups(
+        starts, np.asarray(ids, np.int32), means, sh0, opacities, centres, footprints, counts, plane_weight,
+        np.empty((longest, 8)), np.empty(longest), np.empty((2, longest), np.int64), np.empty(most + 1, np.int64),
+        np.empty((most, 18)), child_starts, child_ids, parents, num_children, errors,
+    )  # fmt: skip
+    count = int(num_children[0])
+    return child_starts[: count + 1].copy(), child_ids, parents[:count].copy()
 
 
 # `caps` and `order` are work space for the longest group

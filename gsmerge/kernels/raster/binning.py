@@ -15,11 +15,11 @@ def sort_bits(bits, order, keys, spare):
     """Write the stable ascending order of ``bits`` to ``order``, with ``keys`` and ``spare`` as scratch."""
 
 
-def depth_order(bits):
-    """Return the stable order ``[m]`` int32 of positive depths, nearest first, from their ``bits [m]`` as uint32."""
-    m = len(bits)
+def depth_order(depths):
+    """Return the order ``[m]`` int32 of ``depths [m]`` float32 above 0, nearest first. Equal depths stay in order."""
+    m = len(depths)
     order = np.empty(m, np.int32)
-    sort_bits(bits, order, np.empty(m, np.uint64), np.empty(m, np.uint64))
+    sort_bits(depths.view(np.uint32), order, np.empty(m, np.uint64), np.empty(m, np.uint64))
     return order
 
 

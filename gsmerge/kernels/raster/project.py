@@ -1,4 +1,4 @@
-"""Project Gaussians into a view, to find which ones it may show, with their conics and boxes. Run the backward pass.
+"""Project Gaussians into a view, to find which ones it may show, with conics, boxes and colours. Run the backward pass.
 
 Cameras, Gaussians and images follow the conventions of gsplat. The dilation is 0.3 square pixels. Conics follow from
 the first-order (EWA) projection, whose directions are clamped 15 % outside the image. Contributions below 1/255 are
@@ -11,6 +11,8 @@ The backward pass computes gradients of means, rotations, scales and opacities f
 pass follows "Mathematical supplement for the gsplat library" (Ye 2023) and EWA splatting (Zwicker 2001). Gradients pass
 through the conic to half axes, rotation and scale. Gradients reach the mean through its image position and through the
 derivative of the projection.
+
+The colours that Gaussians show to a camera are spherical harmonics of the direction of view.
 """
 
 from __future__ import annotations
@@ -82,6 +84,28 @@ def project_backward(
         last: End of the range, exclusive.
         grad_poses: ``[blocks,POSE]`` float32, written: gradient with respect to the world-to-camera matrix, summed over
             blocks of ``BLOCK`` Gaussians. It may be None.
+    """
+
+
+@native(
+    STATUS, means=f4("n", 3), sh0=f4("n", 1, 3), shN=f4("n", "num", 3), ids=i4("m"), eye=f4(3),
+    first=i8(least=0, most="m"), last=i8(least="first", most="m"), colors=f4("m", 3, out=True),
+)  # fmt: skip
+def view_colors(means, sh0, shN, ids, eye, first, last, colors):
+    """Write the colours of a range of the listed Gaussians as seen from ``eye [3]``, at least 0."""
+
+
+@native(
+    STATUS, means=f4("n", 3), shN=f4("n", "num", 3), ids=i4("m"), eye=f4(3), first=i8(least=0, most="m"),
+    last=i8(least="first", most="m"), colors=f4("m", 3), grad_colors=f4("m", 3), grad_sh0=f4("m", 1, 3, out=True),
+    grad_shN=f4("m", "num", 3, out=True), grad_means=f4("m", 3, out=True),
+)  # fmt: skip
+def view_colors_backward(means, shN, ids, eye, first, last, colors, grad_colors, grad_sh0, grad_shN, grad_means):
+    """Run the backward pass of :func:`view_colors` for a range of the listed Gaussians.
+
+    Args:
+        colors: ``[m,3]`` float32 colours of :func:`view_colors`. No gradient passes where they are 0.
+        grad_means: ``[m,3]`` float32, written: gradient through the direction in which the eye sees the Gaussian.
     """
 
 

@@ -3,14 +3,28 @@
 The phases run the kernels of the other modules, with the same bits. The buffers are checked once, when the table is
 filled. In a step, every thread makes one call for each phase, whose only arguments are the table and the number of the
 phase, see ``gsmerge/kernels/raster/step.c``.
+
+The gradient of the fit's image loss is computed in one pass over the rows, without images of intermediate values.
+Structural similarity needs sums of the image, the photo and their products over windows. Derivatives of the similarity
+follow from the sums over windows, and are summed over windows as well. Differences between neighbouring pixels are
+computed row by row. Results do not depend on how rows are divided among threads, because each sum is added up in the
+same order wherever a range of rows begins.
 """
 
 from __future__ import annotations
 
+import numpy as np
+
 from gsmerge.kernels.gaussians.optimise import COLUMNS
-from gsmerge.kernels.raster.image_loss import DERIVATIVE_ROWS, EDGE_ROWS, TERMS
 from gsmerge.kernels.raster.project import CAMERA, CONIC, POSE, SUMS
 from gsmerge.kernels.signature import STATUS, Table, f4, i2, i4, i8, native, u1, u8
+
+WINDOW_SIDE = 7  # side of the windows, pixels
+C1, C2 = np.float32(1e-4), np.float32(9e-4)  # constants of SSIM for values from 0 to 1
+
+DERIVATIVE_ROWS, TERMS = 12, 3  # number of rows of derivatives in memory, and of derivatives for each value
+EDGE_ROWS = 7  # number of rows in memory for differences between neighbouring pixels
+SUM_CHUNK, PAD = 96, 9  # number of values that are summed at a time, and of zeros beside a row
 
 # Phases of a step. If most Gaussians of a view are hidden, "count_open" follows "count", and "deal_open" replaces
 # "deal". A list that "deal_open" makes ends at the last visible Gaussian of the tile
@@ -41,6 +55,36 @@ STEP = Table(
     camera=f4(CAMERA), eye=f4(3), background=f4(3), loss_weights=f4(2), rates=f4(COLUMNS), limits=f4(5), betas=f4(2),
     regs=f4(2),
 )  # fmt: skip
+
+
+def room_of(width):
+    """Return how many values a buffer for a row of ``width`` pixels needs, with zeros beside the row."""
+    return -(-3 * width // SUM_CHUNK) * SUM_CHUNK + PAD
+
+
+@native(
+    STATUS, image=f4("height", "width"), photo=f4("height", "width"), weight=f4("height", "pixels"),
+    ssim_lambda=f4(), edge_weight=f4(), first=i8(least=0, most="height"), last=i8(least="first", most="height"),
+    gradient=f4("height", "width", out=True), errors=f4("height", out=True),
+    terms=f4(DERIVATIVE_ROWS, TERMS, "room", out=True), rows=f4(EDGE_ROWS, "room", out=True),
+)  # fmt: skip
+def loss_gradient(image, photo, weight, ssim_lambda, edge_weight, first, last, gradient, errors, terms, rows):
+    """Write the gradient of (1 - ssim_lambda) |e| + ssim_lambda (1 - SSIM) + edge_weight |difference of e|.
+
+    The error e is ``image - photo``. The differences of e are between each pixel and the next pixel in its row and in
+    its column. Pixels have weights, and a difference has the smaller weight of its two pixels. The windows of SSIM have
+    7 x 7 pixels of equal weight. Beyond the border all values are zero.
+
+    Args:
+        image: ``[h,3w]`` float32, with the three channels of a pixel side by side.
+        ssim_lambda: Share of structural similarity, float32.
+        edge_weight: Weight of the differences between neighbouring pixels, float32.
+        first: First row.
+        last: Last row, exclusive.
+        gradient: ``[h,3w]`` float32, written in these rows: the gradient, divided by the number of pixels.
+        errors: ``[h]`` float32, written: weighted squared error of each row.
+        terms, rows: Scratch, whose last axis has the length of :func:`room_of`.
+    """
 
 
 @native(STATUS, table=i8("fields", out=True), phase=i8(least=0, below=len(PHASES)))

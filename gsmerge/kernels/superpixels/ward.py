@@ -38,24 +38,6 @@ merge_costs = declare(
 )  # fmt: skip
 
 
-def _first_ceiling(pairs, rows, share):
-    """Estimate the cost of the last merge, slightly too high, above which edges are put aside at first.
-
-    ``pairs [e,2]`` are the edges between regions, ``rows`` the sums of each region, and ``share`` is the part of the
-    regions that merging removes. The estimate is the quantile ``share`` of the costs of all edges. The estimate is near
-    the cost of the last merge in photos with 1.5 to 3 times as many regions as wanted.
-    """
-    sample_edges = 4096  # the ceiling is estimated from the costs of about this many edges
-    step = max(1, len(pairs) // sample_edges)
-    costs = np.empty(len(pairs) // step, np.float32)
-    merge_costs(rows, pairs[: len(costs) * step : step].copy(), costs)
-    rank = min(int(share * len(costs)), len(costs) - 1)
-    # The kernel adds at most tie_break to each cost, so that pairs of equal cost differ and a round merges many pairs
-    # of a flat picture
-    tie_break = 1e-7
-    return np.float32(max(1.1 * np.partition(costs, rank)[rank], 2 * tie_break))
-
-
 # Returns the number of nodes
 _merge_tree = declare(
     "merge_tree", COUNT, num_leaves=i8(least=0), num_merges=i8(), ceiling=f4(),
@@ -117,7 +99,18 @@ def merge_regions(labels, pixels, num_regions, count, spread):
     rows = region_rows(labels, pixels, num_regions, 2 * num_regions, spread)
     rows[:num_regions, INVERSE] = 1 / rows[:num_regions, NUM_PIXELS]
     pairs = adjacent_pairs(labels)
-    ceiling = _first_ceiling(pairs, rows, num_merges / num_regions)
+    # Edges above a ceiling are put aside at first. The ceiling estimates the cost of the last merge, slightly too high,
+    # by a quantile of the costs of all edges, at the share of the regions that merging removes. The estimate is near
+    # the cost of the last merge in photos with 1.5 to 3 times as many regions as wanted
+    sample_edges = 4096  # the ceiling is estimated from the costs of about this many edges
+    step = max(1, len(pairs) // sample_edges)
+    costs = np.empty(len(pairs) // step, np.float32)
+    merge_costs(rows, pairs[: len(costs) * step : step].copy(), costs)
+    rank = min(int(num_merges / num_regions * len(costs)), len(costs) - 1)
+    # The kernel adds at most tie_break to each cost, so that pairs of equal cost differ and a round merges many pairs
+    # of a flat picture
+    tie_break = 1e-7
+    ceiling = np.float32(max(1.1 * np.partition(costs, rank)[rank], 2 * tie_break))
     parents, num_nodes = merge_tree(pairs, rows, num_regions, num_merges, ceiling)
     if num_nodes - num_regions < num_merges:
         raise ValueError(f"expected finite colours of regions that touch, to merge {num_regions} down to {count}")

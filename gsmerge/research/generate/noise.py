@@ -10,7 +10,7 @@ import numpy as np
 
 from gsmerge.kernels.elementary import exp, log
 from gsmerge.kernels.pictures import blur, convolve
-from gsmerge.kernels.raster.sh import view_colors
+from gsmerge.kernels.raster.project import view_colors
 from gsmerge.research.generate.photograph import Float, Pinhole
 from gsmerge.research.generate.shapes import Array, rotate
 from gsmerge.research.generate.textures import enlarge_texture

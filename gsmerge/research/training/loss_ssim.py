@@ -2,14 +2,14 @@
 
 The windows are uniform, which makes the gradient quick. The SSIM of reports, :func:`gsmerge.raster.metrics.ssim`, has
 Gaussian windows, so its values differ. The full fit takes its loss and gradient from
-``gsmerge/kernels/raster/image_loss``.
+``gsmerge/kernels/raster/step``.
 """
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from gsmerge.kernels.raster.image_loss import C1, C2, WINDOW_SIDE
+from gsmerge.kernels.raster.step import C1, C2, WINDOW_SIDE
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from messages import refuses
 
-from gsmerge.kernels.gaussians.bisect import bisect, split_errors
+from gsmerge.kernels.gaussians.pool import bisect, split_errors
 from gsmerge.types import SH_C0
 
 

@@ -9,7 +9,7 @@ import pytest
 from made_gaussians import random_gaussians
 
 from gsmerge.geometry.transforms import covariances
-from gsmerge.kernels.gaussians.edges import NUM_EDGES, cut_at_edges
+from gsmerge.kernels.gaussians.optimise import NUM_EDGES, cut_at_edges
 from gsmerge.types import Gaussians
 
 REACH = 2.0

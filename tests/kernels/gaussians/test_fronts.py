@@ -10,7 +10,8 @@ from made_gaussians import random_gaussians
 
 from gsmerge.geometry.transforms import project
 from gsmerge.kernels import elementary
-from gsmerge.kernels.gaussians.fronts import order_by_depth, project_centres, weigh_centres
+from gsmerge.kernels.gaussians.fronts import project_centres, weigh_centres
+from gsmerge.kernels.raster.binning import depth_order
 from gsmerge.prepare import true_pixels as pixels_module
 from gsmerge.prepare.true_pixels import find_pixels
 from gsmerge.types import Cameras, Gaussians, Scene
@@ -55,7 +56,7 @@ def weigh(gaussians: Gaussians, view: int) -> tuple[np.ndarray, ...]:
     columns = (np.ascontiguousarray(column, np.float32) for column in (gaussians.means, gaussians.scales))
     opacities = gaussians.opacities.astype(np.float32)
     ids, pixels, depths, areas = project_centres(*columns, CAMERAS.viewmats[view], K, WIDTH, HEIGHT, NEAR)
-    return ids, pixels, weigh_centres(order_by_depth(depths), ids, pixels, areas, opacities, fronts), fronts
+    return ids, pixels, weigh_centres(depth_order(depths), ids, pixels, areas, opacities, fronts), fronts
 
 
 @pytest.mark.parametrize("case", CASES)

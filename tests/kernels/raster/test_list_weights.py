@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -11,13 +11,25 @@ from numpy.testing import assert_allclose
 from slow_renderer import render_arrays
 
 from gsmerge.geometry.transforms import quat_to_rotmat
-from gsmerge.kernels.raster.list_weights import collect
+from gsmerge.kernels.raster.list_weights import LANES, collect, list_weights
 from gsmerge.raster import TiledView, composite, make_splats, splat_adjoint, tile_view
-from gsmerge.raster.weights import ViewWeights, apply_transposed, view_weights
 from gsmerge.types import Gaussians
 
 WIDTH, HEIGHT = 45, 37  # not multiples of a tile
 K = np.array([[40.0, 0, 21.3], [0, 42.0, 19.1], [0, 0, 1]])
+
+
+@dataclass(frozen=True)
+class ViewWeights:
+    """The entries of a view, and the lists of its tiles."""
+
+    ids: np.ndarray
+    flatten_ids: np.ndarray
+    isect_offsets: np.ndarray
+    tile_width: int
+    starts: np.ndarray
+    lanes: np.ndarray
+    weights: np.ndarray
 
 
 def of_case(case: tuple[int, int, float]) -> Gaussians:
@@ -26,7 +38,16 @@ def of_case(case: tuple[int, int, float]) -> Gaussians:
 
 def tile_and_weigh(gaussians: Gaussians) -> tuple[TiledView, ViewWeights]:
     tiled = tile_view(make_splats(gaussians), np.eye(4), K, WIDTH, HEIGHT)
-    return tiled, view_weights(tiled)
+    return tiled, ViewWeights(tiled.ids, *tiled.lists[1:], *list_weights(*tiled.lists, HEIGHT, WIDTH))
+
+
+def apply_transposed(view: ViewWeights, image: np.ndarray) -> np.ndarray:
+    """Return, for each listed Gaussian, its weights times the pixels of ``image [h,w,c]``, by the kernel."""
+    padded, sums = np.zeros((HEIGHT, WIDTH, LANES), np.float32), np.zeros((len(view.ids), LANES))
+    padded[..., : image.shape[2]] = image
+    lists = view.flatten_ids, view.isect_offsets, view.tile_width
+    collect(view.starts, view.lanes, view.weights, *lists, padded, sums)
+    return sums[:, : image.shape[2]]
 
 
 def entry_pixels(weights: ViewWeights) -> np.ndarray:

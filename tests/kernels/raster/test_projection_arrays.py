@@ -14,7 +14,8 @@ from messages import refuses
 from slow_steps import differentiate_rows
 
 from gsmerge.kernels.elementary import exp, sin
-from gsmerge.kernels.raster import image_loss, project, sh
+from gsmerge.kernels.raster import project
+from gsmerge.kernels.raster import step as step_kernels
 
 RNG = np.random.default_rng(0)
 HOSTILE = np.array([np.nan, np.inf, -np.inf, 3e38, -3e38, 1e-40, 0, -0.0], np.float32)
@@ -100,14 +101,14 @@ def colors_of(c: Columns) -> list[np.ndarray]:
     ids, eye = listed(len(c["means"])), np.array([0.1, 0.2, -1], np.float32)
     m, num = len(ids), c["shN"].shape[1]
     results = [np.empty(shape, np.float32) for shape in ((m, 3), (m, 1, 3), (m, num, 3), (m, 3))]
-    sh.view_colors(c["means"], c["sh0"], c["shN"], ids, eye, 0, m, results[0])
+    project.view_colors(c["means"], c["sh0"], c["shN"], ids, eye, 0, m, results[0])
     grad = sin(np.arange(3 * m, dtype=np.float32)).reshape(m, 3)
     head = c["means"], c["shN"], ids, eye
-    sh.view_colors_backward(*head, 0, m, results[0], grad, *results[1:])
+    project.view_colors_backward(*head, 0, m, results[0], grad, *results[1:])
     parts = [np.empty_like(one) for one in results]
     for first, last in ((m // 3, m), (0, m // 3)):  # the later part first: nothing may be written outside a range
-        sh.view_colors(c["means"], c["sh0"], c["shN"], ids, eye, first, last, parts[0])
-        sh.view_colors_backward(*head, first, last, parts[0], grad, *parts[1:])
+        project.view_colors(c["means"], c["sh0"], c["shN"], ids, eye, first, last, parts[0])
+        project.view_colors_backward(*head, first, last, parts[0], grad, *parts[1:])
     for one, part in zip(results, parts, strict=True):
         np.testing.assert_array_equal(one, part)
     return results
@@ -164,8 +165,8 @@ def test_indices_outside_are_refused(wrong: int, place: int) -> None:
         lambda: project.project(*shape, camera_of(), np.zeros((5, 8), np.float32), flat, np.zeros((5, 4), np.int16)),
         lambda: project.project_backward(*shape, sums, camera_of(), 0, 5, rows, quats, rows, flat, None),
         lambda: project.add_rows(ids, rows, np.zeros((10, 3), np.float32)),
-        lambda: sh.view_colors(c["means"], c["sh0"], c["shN"], ids, eye, 0, 5, rows),
-        lambda: sh.view_colors_backward(
+        lambda: project.view_colors(c["means"], c["sh0"], c["shN"], ids, eye, 0, 5, rows),
+        lambda: project.view_colors_backward(
             c["means"], c["shN"], ids, eye, 0, 5, rows, rows, rows[:, None].copy(), shN, rows
         ),
     ]
@@ -179,7 +180,7 @@ def test_ranges_outside_are_refused() -> None:
     ids = np.arange(10, dtype=np.int32)
     for first, last in ((-1, 5), (0, 11), (7, 6)):
         with refuses(ValueError, f"view_colors: {'first' if first < 0 else 'last'}", first if first < 0 else last):
-            sh.view_colors(c["means"], c["sh0"], c["shN"], ids, eye, first, last, colors)
+            project.view_colors(c["means"], c["sh0"], c["shN"], ids, eye, first, last, colors)
     head = c["means"], c["quats"], c["scales"], c["opacities"], ids, np.zeros((10, 9), np.float32), camera_of()
     results = colors, np.zeros((10, 4), np.float32), colors, np.zeros(10, np.float32), None
     with refuses(ValueError, "project_backward", "indices"):  # a range of blocks begins at one
@@ -215,7 +216,7 @@ def test_loss_has_the_same_bits_on_every_processor(each_target: Any, size: tuple
 
 def test_memory_of_the_loss_that_is_too_small_is_refused() -> None:
     image, weight = np.zeros((4, 9), np.float32), np.zeros((4, 3), np.float32)
-    terms, rows = (np.empty((*shape, image_loss.SUM_CHUNK), np.float32) for shape in ((12, 3), (7,)))
+    terms, rows = (np.empty((*shape, step_kernels.SUM_CHUNK), np.float32) for shape in ((12, 3), (7,)))
     outputs = image.copy(), weight[:, 0].copy(), terms, rows
     with refuses(ValueError, "loss_gradient", "indices"):
-        image_loss.loss_gradient(image, image, weight, 0.2, 1.2, 0, 4, *outputs)
+        step_kernels.loss_gradient(image, image, weight, 0.2, 1.2, 0, 4, *outputs)

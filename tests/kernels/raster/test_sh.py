@@ -7,7 +7,7 @@ import pytest
 from slow_renderer import random_gaussians, turned_cameras, view_colors
 from view_gradients_of import assert_near, full, normal, turned_view
 
-from gsmerge.kernels.raster import sh
+from gsmerge.kernels.raster import project
 from gsmerge.raster.composite import view_colors as drawn_colors
 from gsmerge.raster.gradient import color_gradients
 
@@ -23,7 +23,7 @@ def test_colours_seen_from_a_camera_match_the_slow_renderer(degree: int) -> None
     shN = RNG.normal(size=(50, (degree + 1) ** 2 - 1, 3)).astype(np.float32)
     eye, ids = np.array([0.3, -2.0, 1.0], np.float32), np.arange(1, 50, 2, dtype=np.int32)
     colors = np.full((25, 3), -1, np.float32)
-    sh.view_colors(means, sh0, shN, ids, eye, 0, 25, colors)
+    project.view_colors(means, sh0, shN, ids, eye, 0, 25, colors)
     viewmat = torch.eye(4, dtype=torch.float64)
     viewmat[:3, 3] = -torch.from_numpy(eye).double()
     coeffs = torch.from_numpy(np.concatenate([sh0, shN], 1)).double()

@@ -13,6 +13,7 @@ from gsmerge.fit.fit_state import FitState, start_state
 from gsmerge.fit.step_buffers import OF_STEP, StepBuffers
 from gsmerge.kernels.raster.project import POSE
 from gsmerge.kernels.raster.step import PHASES, STEP, fit_phase
+from gsmerge.kernels.signature import FilledTable
 from gsmerge.raster import tiled_view
 from gsmerge.raster.tiled_view import camera_numbers
 from gsmerge.types import Gaussians
@@ -94,7 +95,7 @@ def test_buffers_of_another_size_are_refused(name: str) -> None:
             "counts": np.zeros((2, table["tiles"] + 1), np.int64),
             "light": np.zeros(table["tiles"] + 1, np.float32),
         }
-    short = STEP.fill(arrays)
+    short = FilledTable(STEP, arrays)
     with refuses(ValueError, "fit_phase"):
         for phase in range(len(PHASES)):
             fit_phase.prepare(short.values, phase)()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsmerge.kernels.superpixels import seeds
+from gsmerge.kernels.superpixels import bass
 
 SIZE = (17, 23)
 
@@ -18,4 +18,4 @@ def pixels() -> np.ndarray:
 @pytest.fixture
 def labels() -> np.ndarray:
     """Return 30 connected regions of the picture, not padded."""
-    return seeds.voronoi(seeds.hexagonal_seeds(*SIZE, 30), *SIZE)
+    return bass.voronoi(bass.hexagonal_seeds(*SIZE, 30), *SIZE)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from messages import refuses
 
-from gsmerge.kernels.superpixels import bass, kd, merge_tree, regions, seeds, ward
+from gsmerge.kernels.superpixels import bass, merge_tree, regions, ward
 from gsmerge.kernels.superpixels.regions import pad_labels
 
 SPREAD = np.float32(0.01)
@@ -24,8 +24,8 @@ def make_picture(height: int, width: int) -> np.ndarray:
 def all_of_them(height: int, width: int) -> list[np.ndarray]:
     """Return what every kernel makes of a picture, one from the other."""
     pixels, count = make_picture(height, width), max(1, height * width // 16)
-    response = seeds.corner_response(pixels)
-    labels, num_regions = kd.split_rectangles(pixels, 2 * count, 8, 1e-5)
+    response = bass.corner_response(pixels)
+    labels, num_regions = regions.split_rectangles(pixels, 2 * count, 8, 1e-5)
     merged = ward.merge_regions(labels, pixels, num_regions, count, SPREAD)
     refined = regions.refine(merged.copy(), pixels, count, 3, SPREAD)
     depths = (2 + response).astype(np.float32)
@@ -33,8 +33,8 @@ def all_of_them(height: int, width: int) -> list[np.ndarray]:
     error = merge_tree.region_sums(refined, pixels, depths, count, rows)
     tree = merge_tree.merge_order(ward.adjacent_pairs(refined), rows, 1.0, 1e-5, 9.0)
     cut = merge_tree.cut_labels(tree[0], np.arange(count - 1) < count // 2, count)
-    places = seeds.seeds_from_density(seeds.seed_density(response, count), count)
-    grown = pad_labels(seeds.voronoi(places, height, width))
+    places = bass.seeds_from_density(bass.seed_density(response, count), count)
+    grown = pad_labels(bass.voronoi(places, height, width))
     found = bass.infer_labels(grown.copy(), pixels, count)
     fitted = bass.fit_regions(found, pixels, np.full(count, 16.0))
     return [
@@ -54,15 +54,15 @@ def test_every_kernel_takes_a_picture_without_pixels() -> None:
     labels, pixels, sums = np.full((2, 2), -1, np.int32), np.empty((0, 0, 3), np.float32), np.empty((0, 20))
     assert regions.region_rows(labels, pixels, 0, 2, SPREAD).tolist() == [[0] * 8] * 2
     assert regions.sweep(labels, pixels, np.empty((0, 8), np.float32), regions.CONNECTIVITY, SPREAD, False) == 0
-    assert kd.integral_image(pixels).tolist() == [[0, 0, 0]]
+    assert regions.integral_image(pixels).tolist() == [[0, 0, 0]]
     assert len(ward.adjacent_pairs(labels)) == 0
     assert merge_tree.region_sums(labels, pixels, np.empty((0, 0), np.float32), 0, sums) == 0
     assert [len(a) for a in merge_tree.merge_order(np.empty((0, 2), np.int32), sums, 1.0, 1.0, 1.0)] == [0, 0, 0]
     assert len(merge_tree.cut_labels(np.empty(0, np.int32), np.empty(0, bool), 0)) == 0
     assert bass.fit_regions(labels, pixels, np.empty(0)).shape == (0, 9)
-    assert seeds.dither(np.empty((0, 0))).shape == (0, 0)
-    assert seeds.voronoi(np.empty((0, 2), np.int64), 0, 0).shape == (0, 0)
-    assert seeds.voronoi(np.empty((0, 2), np.int64), 1, 2).tolist() == [[-1, -1]]
+    assert bass.dither(np.empty((0, 0))).shape == (0, 0)
+    assert bass.voronoi(np.empty((0, 2), np.int64), 0, 0).shape == (0, 0)
+    assert bass.voronoi(np.empty((0, 2), np.int64), 1, 2).tolist() == [[-1, -1]]
 
 
 KERNELS: dict[str, Callable[[np.ndarray, np.ndarray], object]] = {
@@ -98,15 +98,15 @@ def test_labels_of_another_size_are_refused(kernel: str) -> None:
 
 
 def test_bad_indices_are_refused() -> None:
-    rows, tree, integral = np.ones((4, 8), np.float32), np.ones((4, 20)), kd.integral_image(make_picture(3, 4))
+    rows, tree, integral = np.ones((4, 8), np.float32), np.ones((4, 20)), regions.integral_image(make_picture(3, 4))
     cut, ring, same = merge_tree.cut_labels, regions.ring_mask, np.array([[1, 1]], np.int32)
     outside = [
         *((cut, np.array(parents, np.int32), np.ones(1, bool), 2)
           for parents in ([-1, 0, -1], [1, -1, -1], [3, -1, -1], [2, 2, 2])),
-        *((seeds.voronoi, np.array([[0, 0], place]), 3, 4) for place in ([-1, 0], [0, 4], [3, 0])),
+        *((bass.voronoi, np.array([[0, 0], place]), 3, 4) for place in ([-1, 0], [0, 4], [3, 0])),
         *((ring, ONE, y, x, 0) for y, x in ((0, 1), (1, 0), (2, 1), (1, 2))),
         (cut, np.array([2, 2, -1], np.int32), np.ones(0, bool), 2),
-        (kd.cut_gain, integral, 0, 4, 5, 4, 1.0, 0.0, np.empty(2)),
+        (regions.cut_gain, integral, 0, 4, 5, 4, 1.0, 0.0, np.empty(2)),
         (merge_tree.merge_order, same, tree, 1.0, 1.0, 1.0), (ward.merge_tree, same[:0], rows, 3, 1, np.float32(1)),
     ]  # fmt: skip
     far = np.array([[0, 4]], np.int32), np.empty(1, np.float32)
@@ -126,8 +126,8 @@ def test_odd_colours_leave_labels_in_their_range(value: float) -> None:
     height, width, count = 9, 11, 6
     pixels = make_picture(height, width)
     pixels[4, 5] = pixels[0, 0, 1] = value
-    labels = pad_labels(seeds.voronoi(seeds.hexagonal_seeds(height, width, count), height, width))
-    rectangles, number = kd.split_rectangles(pixels, 20, 4, 1e-5)
+    labels = pad_labels(bass.voronoi(bass.hexagonal_seeds(height, width, count), height, width))
+    rectangles, number = regions.split_rectangles(pixels, 20, 4, 1e-5)
     assert set(np.unique(rectangles)) == set(range(-1, number))
     assert set(np.unique(regions.refine(labels.copy(), pixels, count, 2, SPREAD))) == set(range(-1, count))
     assert set(np.unique(bass.infer_labels(labels.copy(), pixels, count))) == set(range(-1, count))
@@ -141,4 +141,4 @@ def test_odd_colours_leave_labels_in_their_range(value: float) -> None:
 
 
 def test_last_of_equal_seeds_gets_the_pixels() -> None:
-    assert seeds.voronoi(np.zeros((9, 2), np.int64), 2, 2).tolist() == [[8, 8], [8, 8]]
+    assert bass.voronoi(np.zeros((9, 2), np.int64), 2, 2).tolist() == [[8, 8], [8, 8]]

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from regions_of_noise import COMPACTNESS, features, squared_error, total_error
 
-from gsmerge.kernels.superpixels import kd
+from gsmerge.kernels.superpixels import regions
 
 
 def test_integral_image_sums_the_pixels_above_and_left(pixels: np.ndarray) -> None:
     expected = np.zeros((18, 24, 3))
     expected[1:, 1:] = pixels.astype(np.float64).cumsum(0).cumsum(1)
-    assert kd.integral_image(pixels) == pytest.approx(expected.reshape(-1, 3))
+    assert regions.integral_image(pixels) == pytest.approx(expected.reshape(-1, 3))
 
 
 def brute_cuts(pixels: np.ndarray, y0: int, x0: int, y1: int, x1: int) -> list[tuple[float, int, int]]:
@@ -31,11 +31,11 @@ def brute_cuts(pixels: np.ndarray, y0: int, x0: int, y1: int, x1: int) -> list[t
 @pytest.mark.parametrize("box", [(0, 0, 17, 23), (3, 5, 9, 6), (4, 4, 5, 12), (10, 2, 12, 4), (6, 6, 7, 7)])
 def test_best_cut_is_the_largest_fall_of_the_error(pixels: np.ndarray, box: tuple[int, int, int, int]) -> None:
     y0, x0, y1, x1 = box
-    integral, near = kd.integral_image(pixels), y0 * 24 + x0
+    integral, near = regions.integral_image(pixels), y0 * 24 + x0
     size = float((y1 - y0) * (x1 - x0))
     for axis, (far, step, side) in enumerate([(near + x1 - x0, 24, y1 - y0), (near + 24 * (y1 - y0), 1, x1 - x0)]):
         found = np.empty(2)
-        kd.cut_gain(integral, near, far, step, side, size, COMPACTNESS, found)
+        regions.cut_gain(integral, near, far, step, side, size, COMPACTNESS, found)
         gain, cut = float(found[0]), int(found[1])
         candidates = [(g, c) for g, a, c in brute_cuts(pixels, *box) if a == axis]
         if candidates:
@@ -69,7 +69,7 @@ def greedy_rectangles(pixels: np.ndarray, count: int) -> np.ndarray:
 
 @pytest.mark.parametrize("count", [1, 2, 3, 20, 200, 391])
 def test_rectangles_have_nearly_the_error_of_greedy_cuts(pixels: np.ndarray, count: int) -> None:
-    padded, num_regions = kd.split_rectangles(pixels, count, 32, COMPACTNESS)
+    padded, num_regions = regions.split_rectangles(pixels, count, 32, COMPACTNESS)
     actual = padded[1:-1, 1:-1]
     assert num_regions == count == len(np.unique(actual))
     for k in range(count):
@@ -80,6 +80,6 @@ def test_rectangles_have_nearly_the_error_of_greedy_cuts(pixels: np.ndarray, cou
 
 
 def test_rectangles_start_from_blocks(pixels: np.ndarray) -> None:
-    padded, num_regions = kd.split_rectangles(pixels, 1, 8, COMPACTNESS)
+    padded, num_regions = regions.split_rectangles(pixels, 1, 8, COMPACTNESS)
     assert num_regions == 4  # 17 x 23 pixels hold 2 x 2 blocks of at least 8
     assert np.bincount(padded[1:-1, 1:-1].reshape(-1)).tolist() == [8 * 11, 8 * 12, 9 * 11, 9 * 12]

@@ -8,8 +8,8 @@ from sweeps import sweep
 
 from gsmerge.kernels import elementary
 from gsmerge.kernels.superpixels import merge_tree as kernels
+from gsmerge.kernels.superpixels.bass import hexagonal_seeds, voronoi
 from gsmerge.kernels.superpixels.regions import pad_labels
-from gsmerge.kernels.superpixels.seeds import hexagonal_seeds, voronoi
 from gsmerge.kernels.superpixels.ward import adjacent_pairs
 
 SLOPE_RIDGE = 1e-3  # square pixels, as in merge_tree.c

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsmerge.kernels.superpixels import seeds
-from gsmerge.kernels.superpixels.seeds import hexagonal_seeds, seed_density
+from gsmerge.kernels.superpixels import bass
+from gsmerge.kernels.superpixels.bass import hexagonal_seeds, seed_density
 
 
 def test_voronoi_regions_hold_the_nearest_pixels() -> None:
-    places = seeds.hexagonal_seeds(13, 19, 11)
-    labels = seeds.voronoi(places, 13, 19)
+    places = bass.hexagonal_seeds(13, 19, 11)
+    labels = bass.voronoi(places, 13, 19)
     pixel = np.stack(np.mgrid[:13, :19], -1)
     steps = np.abs(pixel[:, :, None] - places).sum(-1)
     assert np.array_equal(np.take_along_axis(steps, labels[..., None].astype(int), 2)[..., 0], steps.min(-1))
@@ -25,7 +25,7 @@ def slow_dither(density: np.ndarray) -> np.ndarray:
         ahead = 1 if y % 2 == 0 else -1
         for x in range(width)[::ahead]:
             noise = (noise * 1664525 + 1013904223) % 2**32
-            seeds_at[y, x] = left[y, x] > 0.5 + seeds.JITTER * ((noise >> 8) / 2**24 - 0.5)
+            seeds_at[y, x] = left[y, x] > 0.5 + bass.JITTER * ((noise >> 8) / 2**24 - 0.5)
             error = left[y, x] - seeds_at[y, x]
             for v, u, share in ((0, ahead, 7), (1, -ahead, 3), (1, 0, 5), (1, ahead, 1)):
                 if y + v < height and 0 <= x + u < width:
@@ -35,15 +35,15 @@ def slow_dither(density: np.ndarray) -> np.ndarray:
 
 def test_dithered_seeds_match_a_slow_twin(pixels: np.ndarray) -> None:
     density = pixels[..., 0].astype(np.float64) ** 2
-    actual = seeds.dither(density)
+    actual = bass.dither(density)
     assert np.array_equal(actual, slow_dither(density))
     assert actual.sum() == pytest.approx(density.sum(), rel=0.1)
 
 
 @pytest.mark.parametrize("count", [1, 5, 60, 117])
 def test_seeds_follow_the_density_to_the_exact_count(count: int) -> None:
-    density = seeds.seed_density(np.random.default_rng(1).random((9, 13)), count)
-    places = seeds.seeds_from_density(density, count)
+    density = bass.seed_density(np.random.default_rng(1).random((9, 13)), count)
+    places = bass.seeds_from_density(density, count)
     assert len({(y, x) for y, x in places.tolist()}) == count
 
 

@@ -7,7 +7,7 @@ import pytest
 from regions_of_noise import RING, SPREAD, ring_of, total_error
 from skimage.measure import label as connected_parts
 
-from gsmerge.kernels.superpixels import regions, seeds
+from gsmerge.kernels.superpixels import bass, regions
 from gsmerge.kernels.superpixels.regions import pad_labels, region_rows
 
 
@@ -49,7 +49,7 @@ def slow_sweep(pixels: np.ndarray, labels: np.ndarray, backward: bool) -> np.nda
 @pytest.mark.parametrize("backward", [False, True])
 def test_sweep_makes_the_moves_that_lower_the_error(backward: bool) -> None:
     pixels = np.random.default_rng(5).random((9, 11, 3), dtype=np.float32)
-    labels = seeds.voronoi(seeds.hexagonal_seeds(9, 11, 12), 9, 11)
+    labels = bass.voronoi(bass.hexagonal_seeds(9, 11, 12), 9, 11)
     padded = pad_labels(labels)
     rows = region_rows(padded, pixels, 12, 12, SPREAD)
     rows[:, regions.LEAVE], rows[:, regions.JOIN] = rows[:, 5] / (rows[:, 5] - 1), rows[:, 5] / (rows[:, 5] + 1)

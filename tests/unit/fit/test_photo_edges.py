@@ -13,7 +13,7 @@ from gsmerge.fit.edges import Edges, cut_state, find_edges, split_at_edges
 from gsmerge.fit.fit_state import FitState, gaussians_of, start_state
 from gsmerge.fit.full import fit_full
 from gsmerge.geometry.transforms import project
-from gsmerge.kernels.gaussians.edges import cut_at_edges
+from gsmerge.kernels.gaussians.optimise import cut_at_edges
 from gsmerge.raster import render
 from gsmerge.raster.photos import Photos
 from gsmerge.runtime.threads import use_threads

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from messages import refuses
 
-from gsmerge.kernels.superpixels.seeds import seed_density, seeds_from_density
+from gsmerge.kernels.superpixels.bass import seed_density, seeds_from_density
 from gsmerge.settings.stages import SEGMENTATIONS, SegmentOptions
 from gsmerge.stages.counts import count_for
 from gsmerge.stages.superpixels import saliency, segment, superpixels

@@ -10,7 +10,7 @@ import pytest
 from gsmerge import Cameras, Gaussians
 from gsmerge.geometry.transforms import project, quat_to_rotmat
 from gsmerge.kernels.elementary import log
-from gsmerge.kernels.raster.sh import view_colors
+from gsmerge.kernels.raster.project import view_colors
 from gsmerge.research.generate import NoiseOptions
 from gsmerge.research.generate.noise import (
     ERRORS,
