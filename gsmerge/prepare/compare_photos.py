@@ -86,13 +86,17 @@ def compare_photos(scene: PicturedScene, look: Look = "auto") -> tuple[PicturedS
         note(Doubt(f"{problem}; --set look=photos gives it the look of the photos"))
         return scene, ()
     stray = [view for view in photo_views if view not in matching]
-    if stray and not _note_stray(scene, stray, photo_views):
-        return scene, ()
-    curves = find_tones(pairs, matching)
-    if pairs.shown.drawn and not have_other_tones(scene, matching):
-        curves = [None] * len(pairs)
-    changes = [PhotoChange(curve) for curve in curves]
-    _note_tones(scene, changes, matching)
+    if stray:
+        names = [scene.names[view] for view in stray]
+        record_choices(photos_left_out=names)
+        are_few, listed = 2 * len(stray) <= len(photo_views), list_some(names)
+        result = f" and are not used: {listed}"
+        if not are_few:
+            result = f", so no photo is used: {listed}; check their names and order"
+        note(Doubt(f"{len(stray)} of {len(photo_views)} photos {STRAY_PHOTOS}{result}"))
+        if not are_few:
+            return scene, ()
+    changes = correct_tones(scene, pairs, matching)
     hidden, pictures = np.zeros(scene.images.shape[:3], bool), None
     if scene.has_own_pixels:
         hidden, pictures = _find_hidden(scene, changes)
@@ -103,15 +107,16 @@ def compare_photos(scene: PicturedScene, look: Look = "auto") -> tuple[PicturedS
     return _change_photos(scene, changes, hidden, pictures, matching), tuple(matching)
 
 
-def find_tones(pairs: Pairs, views: Sequence[int]) -> list[np.ndarray | None]:
-    """Find, for each view, the tone curve ``[3,256]`` from its photo to its Gaussians; None if tones are equal.
+def correct_tones(scene: PicturedScene, pairs: Pairs, views: Sequence[int]) -> list[PhotoChange]:
+    """Find, for each of ``views``, the tone curve ``[3,256]`` from its photo to its Gaussians.
 
-    If the pictures of the Gaussians are drawings, all photos share a curve. If no photo changes by more than
-    :data:`EXPOSURE_STEP`, no curve counts, because models themselves change tones slightly. A curve counts only if the
-    inverse curve, from Gaussians to photos, reduces errors, too. The inverse curve reduces no errors if photos and
-    Gaussians differ by noise, which flattens the colours of Gaussians.
+    Returns the change of each photo of the scene, and makes a note if tones differ. If the pictures of the Gaussians
+    are drawings, all photos share a curve. If no photo changes by more than :data:`EXPOSURE_STEP`, no curve counts,
+    because models themselves change tones slightly. A curve counts only if the inverse curve, from Gaussians to photos,
+    reduces errors, too. The inverse curve reduces no errors if photos and Gaussians differ by noise, which flattens the
+    colours of Gaussians.
     """
-    curves, is_large = list[np.ndarray | None]([None] * len(pairs)), False
+    curves, is_large = dict[int, np.ndarray](), False
     stored = cut_blocks(pairs)
     groups = [group for group in _group_by_curve(pairs, views) if is_visible(stored.errors(group))]
     toned, inverse = tone_blocks(pairs, groups), tone_blocks(pairs.exchange(), groups)
@@ -121,9 +126,18 @@ def find_tones(pairs: Pairs, views: Sequence[int]) -> list[np.ndarray | None]:
             is_large |= bool(np.nanmedian(stored.distances(toned.photos, group)) > EXPOSURE_STEP)
             colors, targets = (images[group].reshape(-1, 3) for images in (pairs.photos, pairs.shown.pictures))
             curve = fit_tones(colors, targets, pairs.shown.weights[group].reshape(-1))
-            for view in group:
-                curves[view] = curve
-    return curves if is_large else [None] * len(pairs)
+            curves |= dict.fromkeys(group, curve)
+    if not is_large or (pairs.shown.drawn and not have_other_tones(scene, views)):
+        return [PhotoChange()] * len(pairs)
+    middle_grey = 128  # level of 255 at which notes report the change of tone
+    factors = [float(curve[:, middle_grey].mean()) / (middle_grey / 255) for curve in curves.values()]
+    low, high = min(factors), max(factors)
+    factor = f"{low:.2f}" if high - low < 0.01 else f"{low:.2f} to {high:.2f}"
+    note(
+        f"{len(curves)} of {len(views)} photos have another tone than their Gaussians (exposure, gamma or linear"
+        f" light), which is corrected; middle grey times {factor}: {list_some([scene.names[view] for view in curves])}"
+    )
+    return [PhotoChange(curves.get(view)) for view in range(len(pairs))]
 
 
 def find_grey(pairs: Pairs, views: Sequence[int]) -> dict[int, float]:
@@ -250,36 +264,6 @@ def _is_mapped(pairs: Pairs) -> bool:
     toned, mapped = tone_blocks(pairs, _group_by_curve(pairs, range(len(pairs)))), map_blocks(stored)
     return is_visible(toned.errors()) and all(
         explains(blocks.errors(), mapped.errors()) for blocks in (toned, plain_blocks(stored))
-    )
-
-
-def _note_stray(scene: PicturedScene, stray: Sequence[int], photo_views: Sequence[int]) -> bool:
-    """Note and record the ``stray`` views, whose photos do not show the scene; return whether other photos are used.
-
-    If more than half of the photos, those of ``photo_views``, do not show the scene, no photo is used.
-    """
-    names = [scene.names[view] for view in stray]
-    record_choices(photos_left_out=names)
-    are_few, listed = 2 * len(stray) <= len(photo_views), list_some(names)
-    result = f" and are not used: {listed}"
-    if not are_few:
-        result = f", so no photo is used: {listed}; check their names and order"
-    note(Doubt(f"{len(stray)} of {len(photo_views)} photos {STRAY_PHOTOS}{result}"))
-    return are_few
-
-
-def _note_tones(scene: PicturedScene, changes: Sequence[PhotoChange], views: Sequence[int]) -> None:
-    """Note by which factors the photos of ``views`` get brighter or darker."""
-    toned = {view: curve for view in views if (curve := changes[view].tones) is not None}
-    if not toned:
-        return
-    middle_grey = 128  # level of 255 at which notes report the change of tone
-    factors = [float(curve[:, middle_grey].mean()) / (middle_grey / 255) for curve in toned.values()]
-    low, high = min(factors), max(factors)
-    factor = f"{low:.2f}" if high - low < 0.01 else f"{low:.2f} to {high:.2f}"
-    note(
-        f"{len(toned)} of {len(views)} photos have another tone than their Gaussians (exposure, gamma or linear"
-        f" light), which is corrected; middle grey times {factor}: {list_some([scene.names[view] for view in toned])}"
     )
 
 

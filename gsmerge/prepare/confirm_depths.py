@@ -19,7 +19,7 @@ from gsmerge.kernels.elementary import log
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.budget import parse_share
 from gsmerge.settings.stages import SHARE
-from gsmerge.types import Cameras, Scene
+from gsmerge.types import Scene
 
 CONFIRM_PIXELS = 1200  # sampled pixels of a view
 CONFIRM_NEIGHBORS = 16  # nearest other views in which the sampled pixels are looked up
@@ -105,80 +105,61 @@ def confirm_depths(scene: Scene) -> Agreement | None:
     num_pixels = int(counts[:, 0, 0].sum())
     if num_pixels == 0:
         return None
+    cameras = scene.cameras
+    baseline = np.linalg.norm(np.ptp(cameras.centres, axis=0))
+    from_one_point = baseline * cameras.Ks[:, 0, 0].max() < AGREEMENT_PIXELS * scene_depth(scene)
     confirmed, contradicted, alone = counts[:, 0, 1:].sum(0) / num_pixels
     contradicted_part, alone_part = (_worst_part(counts[:, 1:, kind], counts[:, 1:, 0]) for kind in (2, 3))
     return Agreement(
         float(confirmed), float(contradicted), float(alone), num_pixels, contradicted_part, alone_part,
-        from_one_point=_is_from_one_point(scene),
+        from_one_point=bool(from_one_point),
     )  # fmt: skip
 
 
 def _count_view(scene: Scene, view: int) -> np.ndarray:
     """Count the sampled pixels of a view, ``[part,4]``: those that count, are confirmed, are contradicted, are alone.
 
-    The first part is the whole picture; the other parts are ``THIRDS``.
-    """
-    width, height = scene.cameras.width, scene.cameras.height
-    rows = np.flatnonzero(scene.get_pixels().fronts[view].reshape(-1) >= 0)
-    rows = rows[np.random.default_rng(view).integers(max(len(rows), 1), size=min(len(rows), CONFIRM_PIXELS))]
-    num_same, num_through, is_alone, is_counted = _look_up_pixels(scene, view, rows)
-    kinds = (num_same > 0) & (num_same >= num_through), num_through > num_same, is_alone
-    column, row = 3 * (rows % width) // width, 3 * (rows // width) // height  # in thirds of the picture
-    parts = [is_counted]
-    for (left, right), (top, bottom) in THIRDS.values():
-        parts.append(is_counted & (column >= left) & (column < right) & (row >= top) & (row < bottom))
-    return np.array([[part.sum(), *((part & kind).sum() for kind in kinds)] for part in parts])
-
-
-def _look_up_pixels(scene: Scene, view: int, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Look up n pixels ``rows`` of a view in the nearest other views.
-
-    Returns four arrays ``[n]``: the number of views that confirm the depth of a pixel, the number of views that see
-    through its surface, whether no view sees its position, and whether the pixel counts.
+    The first part is the whole picture; the other parts are ``THIRDS``. The pixels are looked up in the nearest other
+    views.
     """
     means, cameras = scene.gaussians.means, scene.cameras
+    width, height = cameras.width, cameras.height
     fronts = scene.get_pixels().fronts.reshape(len(scene), -1)
+    rows = np.flatnonzero(fronts[view] >= 0)
+    rows = rows[np.random.default_rng(view).integers(max(len(rows), 1), size=min(len(rows), CONFIRM_PIXELS))]
     points = means[fronts[view, rows]].astype(np.float64)
     neighbors = nearest_views(cameras.centres, view)[:CONFIRM_NEIGHBORS]
     pixels, depths = project(points, cameras[neighbors])
     x, y = pixels[..., 0], pixels[..., 1]
-    inside = (depths > LEAST_DEPTH) & (x > 0) & (y > 0) & (x < cameras.width) & (y < cameras.height)
+    inside = (depths > LEAST_DEPTH) & (x > 0) & (y > 0) & (x < width) & (y < height)
     neighbor_ids, ids = np.nonzero(inside)  # pairs of a neighbour and a point in its picture
     column, row = x[neighbor_ids, ids].astype(np.int64), y[neighbor_ids, ids].astype(np.int64)
-    front = fronts[neighbors[neighbor_ids], row * cameras.width + column]
+    front = fronts[neighbors[neighbor_ids], row * width + column]
     has_front = front >= 0
     neighbor_ids, ids = neighbor_ids[has_front], ids[has_front]  # only pairs with a Gaussian at the point's pixel
-    is_alone = np.asarray(~inside.any(0))
+    is_alone = np.asarray(~inside.any(0))  # no view sees the pixel's position
     is_counted = is_alone.copy()
     is_counted[ids] = True
-    surface = means.take(front[has_front], 0).astype(np.float64)  # the points that the neighbours show at these pixels
-    distance = _distance_back(surface, rows[ids], cameras[[view]])
+    # Project the points that the neighbours show at these pixels back into the view. The distance from the pixel is in
+    # units of the distance up to which a point agrees with its pixel. Points behind the camera are infinitely far
+    surface = means.take(front[has_front], 0).astype(np.float64)
+    own_pixels = np.stack([rows[ids] % width, rows[ids] // width], 1) + 0.5
+    (projected,), (own_depths,) = project(surface, cameras[[view]])
+    right, down = (projected - own_pixels).T
+    reach = max(AGREEMENT_PIXELS, AGREEMENT_SHARE * max(width, height))
+    distance = np.where(own_depths > LEAST_DEPTH, np.sqrt(right * right + down * down), np.inf) / reach
     surface_depths = camera_depths(surface, cameras.viewmats[neighbors[neighbor_ids]])
     # distance of the point behind the neighbour's surface; negative in front of the surface
     log_depths = log(depths[neighbor_ids, ids] / np.maximum(surface_depths, LEAST_DEPTH))
     agrees = (distance < 1) & (np.abs(log_depths) < SAME_LOG_DEPTH)
     sees_through = ~agrees & ((log_depths < -2 * SAME_LOG_DEPTH) | ((log_depths < 0) & (distance > 2)))
     num_same, num_through = (np.bincount(ids[mask], minlength=len(rows)) for mask in (agrees, sees_through))
-    return num_same, num_through, is_alone, is_counted
-
-
-def _distance_back(points: np.ndarray, rows: np.ndarray, camera: Cameras) -> np.ndarray:
-    """Project points ``[m,3]`` into a camera; return their distances ``[m]`` from the pixels ``rows [m]``.
-
-    The unit is the distance up to which a point agrees with its pixel. Points behind the camera are infinitely far.
-    """
-    pixels = np.stack([rows % camera.width, rows // camera.width], 1) + 0.5
-    (projected,), (depths,) = project(points, camera)
-    right, down = (projected - pixels).T
-    reach = max(AGREEMENT_PIXELS, AGREEMENT_SHARE * max(camera.width, camera.height))
-    return np.where(depths > LEAST_DEPTH, np.sqrt(right * right + down * down), np.inf) / reach
-
-
-def _is_from_one_point(scene: Scene) -> bool:
-    """Return whether cameras are so close that points at the scene's depth shift by under ``AGREEMENT_PIXELS``."""
-    cameras = scene.cameras
-    baseline = np.linalg.norm(np.ptp(cameras.centres, axis=0))
-    return bool(baseline * cameras.Ks[:, 0, 0].max() < AGREEMENT_PIXELS * scene_depth(scene))
+    kinds = (num_same > 0) & (num_same >= num_through), num_through > num_same, is_alone
+    column, row = 3 * (rows % width) // width, 3 * (rows // width) // height  # in thirds of the picture
+    parts = [is_counted]
+    for (left, right_end), (top, bottom) in THIRDS.values():
+        parts.append(is_counted & (column >= left) & (column < right_end) & (row >= top) & (row < bottom))
+    return np.array([[part.sum(), *((part & kind).sum() for kind in kinds)] for part in parts])
 
 
 def _worst_part(poor: np.ndarray, pixels: np.ndarray) -> str:

@@ -55,22 +55,18 @@ def crop_scene(scene: Scene, crop: str) -> Scene:
     note(f"crop: {count:,} of {scene.num_gaussians:,} Gaussians are inside; counts, fit and scores refer to these")
     masks = scene.masks
     if scene.images is not None:
-        shown = show_rows(scene, inside)
+        canonical, _ = canonicalise(scene)
+        colors = np.ones((len(inside), 1, 3), np.float32)  # in red only the Gaussians inside are 1, in green all are
+        colors[~inside, :, 0] = 0
+        gaussians = replace(canonical.gaussians, sh0=rgb_to_sh0(colors), shN=np.zeros((len(inside), 0, 3), np.float32))
+
+        def shows_inside(image: np.ndarray) -> np.ndarray:
+            """Return a mask ``[h,w]`` of the pixels of a render that mostly show Gaussians inside."""
+            inside_opacity, opacity = image[..., 0], image[..., 1]
+            return np.asarray(inside_opacity > MOSTLY * np.maximum(opacity, usual_opacity(opacity)))
+
+        with use_threads() as threads:
+            views = render_in_batches(gaussians, canonical.cameras, at_once=threads, convert=shows_inside)
+            shown = np.stack(list(views))
         masks = shown if masks is None else masks & shown
     return replace(take_rows(scene, np.flatnonzero(inside)), masks=masks)
-
-
-def show_rows(scene: Scene, rows: np.ndarray) -> np.ndarray:
-    """Return a mask ``[v,h,w]`` of the pixels that mostly show Gaussians marked in the mask ``rows [n]``."""
-    canonical, _ = canonicalise(scene)
-    colors = np.ones((len(rows), 1, 3), np.float32)  # in red only marked Gaussians are 1, in green all are
-    colors[~rows, :, 0] = 0
-    gaussians = replace(canonical.gaussians, sh0=rgb_to_sh0(colors), shN=np.zeros((len(rows), 0, 3), np.float32))
-
-    def shows_rows(image: np.ndarray) -> np.ndarray:
-        """Return the mask ``[h,w]`` of one view from its render."""
-        marked_opacity, opacity = image[..., 0], image[..., 1]
-        return np.asarray(marked_opacity > MOSTLY * np.maximum(opacity, usual_opacity(opacity)))
-
-    with use_threads() as threads:
-        return np.stack(list(render_in_batches(gaussians, canonical.cameras, at_once=threads, convert=shows_rows)))

@@ -12,14 +12,14 @@ import numpy as np
 
 from gsmerge.fit.outside import outside_cameras
 from gsmerge.geometry.transforms import motion_matrices
-from gsmerge.geometry.views import concat_cameras, even_views
+from gsmerge.geometry.views import concat_cameras, even_views, resize_cameras
 from gsmerge.kernels.elementary import arctan2
 from gsmerge.kernels.matrices import matmul
-from gsmerge.prepare.place_cameras import CANDIDATE_GAUSSIANS, choose_showing
+from gsmerge.prepare.place_cameras import CANDIDATE_GAUSSIANS, PROBE, choose_candidates
 from gsmerge.prepare.true_pixels import find_pixels
 from gsmerge.raster import render
 from gsmerge.raster.images import thin_out
-from gsmerge.raster.photos import blank_photos, photo_errors
+from gsmerge.raster.photos import NEAR_PLANE, blank_photos, photo_errors
 from gsmerge.runtime.record import note, record_choices
 from gsmerge.types import Cameras, Gaussians, LargePhotos, PicturedScene, Pixels, make_scene
 
@@ -70,25 +70,21 @@ def _place_beside(gaussians: Gaussians, outside: np.ndarray, cameras: Cameras) -
     sample, step = thin_out(gaussians, CANDIDATE_GAUSSIANS), max(1, -(-len(gaussians) // CANDIDATE_GAUSSIANS))
     sources = cameras[even_views(len(cameras), min(len(cameras), SOURCES))]
     back = outside_cameras(sample.means, sources, STEPS_BACK * len(sources), BESIDE_LOW, BESIDE_HIGH)
-    candidates = concat_cameras(back, _turn_around(sources))
-    least_added = 0.2  # a further camera is placed if it adds more than this share to what earlier cameras show
-    return candidates[choose_showing(sample, candidates, outside[::step], least_added)]
-
-
-def _turn_around(cameras: Cameras) -> Cameras:
-    """Return copies of cameras, turned full circle about their centres in steps of half the field of view.
-
-    At each step one copy looks straight ahead, one looks up by half the field, and one looks down.
-    """
+    # Copies of the views' cameras turn full circle about their centres in steps of half the field of view. At each step
+    # one copy looks straight ahead, one looks up by half the field, and one looks down
     viewmats, views = [], []
-    for view, (viewmat, K) in enumerate(zip(cameras.viewmats.astype(np.float64), cameras.Ks, strict=True)):
-        wide, high = (arctan2(side / 2, focal) for side, focal in ((cameras.width, K[0, 0]), (cameras.height, K[1, 1])))
+    width, height = cameras.width, cameras.height
+    for view, (viewmat, K) in enumerate(zip(sources.viewmats.astype(np.float64), sources.Ks, strict=True)):
+        wide, high = (arctan2(side / 2, focal) for side, focal in ((width, K[0, 0]), (height, K[1, 1])))
         for azimuth in np.arange(0, 2 * np.pi, wide):  # `wide` and `high` are half the field, in radians
             for elevation in (-high, 0.0, high):
                 motions = motion_matrices(np.array([[0.0, azimuth, 0, 0, 0, 0], [elevation, 0, 0, 0, 0, 0]]))
                 viewmats.append(matmul(matmul(motions[1], motions[0]), viewmat))
                 views.append(view)
-    return replace(cameras, viewmats=np.stack(viewmats), Ks=cameras.Ks[views])
+    candidates = concat_cameras(back, replace(sources, viewmats=np.stack(viewmats), Ks=sources.Ks[views]))
+    small = resize_cameras(candidates, PROBE, PROBE)
+    least_added = 0.2  # a further camera is placed if it adds more than this share to what earlier cameras show
+    return candidates[choose_candidates(sample, small, NEAR_PLANE, least_added, counting=outside[::step])]
 
 
 def _with_drawings(scene: PicturedScene, cameras: Cameras, counting: np.ndarray) -> PicturedScene:
@@ -97,22 +93,19 @@ def _with_drawings(scene: PicturedScene, cameras: Cameras, counting: np.ndarray)
     importance, empty, large = scene.importance, scene.empty, scene.large_photos
     if large is not None:
         large = _with_large_drawings(large, scene.gaussians, cameras)
+    # Gaussians with a pixel in the scene keep it
+    pixels, placed = scene.get_pixels(), find_pixels(make_scene(scene.gaussians, cameras))
+    placed_homes = np.where(placed.homes < 0, -1, placed.homes + len(scene) * scene.pixels_per_view)
+    homes = np.where(pixels.homes < 0, placed_homes, pixels.homes)
     return replace(
-        scene, cameras=concat_cameras(scene.cameras, cameras), pixels=_with_pixels_of(scene, cameras),
+        scene, cameras=concat_cameras(scene.cameras, cameras),
+        pixels=Pixels(homes, np.concatenate([pixels.fronts, placed.fronts]), own=False),
         large_photos=large, names=(*scene.names, *(f"placed {view}" for view in range(len(cameras)))),
         images=np.concatenate([scene.images, render(scene.gaussians, cameras).images.clip(0, 1)]),
         masks=np.concatenate([masks, counting]),
         importance=None if importance is None else np.concatenate([importance, np.ones(counting.shape, np.float32)]),
         empty=None if empty is None else np.concatenate([empty, np.zeros(counting.shape, empty.dtype)]),
     )  # fmt: skip
-
-
-def _with_pixels_of(scene: PicturedScene, cameras: Cameras) -> Pixels:
-    """Return the pixels of a scene with those of further ``cameras``; Gaussians with a pixel in the scene keep it."""
-    pixels, placed = scene.get_pixels(), find_pixels(make_scene(scene.gaussians, cameras))
-    placed_homes = np.where(placed.homes < 0, -1, placed.homes + len(scene) * scene.pixels_per_view)
-    homes = np.where(pixels.homes < 0, placed_homes, pixels.homes)
-    return Pixels(homes, np.concatenate([pixels.fronts, placed.fronts]), own=False)
 
 
 def _with_large_drawings(large: LargePhotos, gaussians: Gaussians, cameras: Cameras) -> LargePhotos:

@@ -81,9 +81,15 @@ def equalise_exposure(scene: PicturedScene, views: Sequence[int], exposure: Expo
         return scene
     differ = f"the same surfaces differ in brightness by factors of {low:.2f} to {high:.2f} between photos"
     if exposure == "auto":
-        if root_mean_square(gains[list(views)]) < DIFFERENT:
+        view_gains, photos = gains[list(views)], [scene.images[view][::COARSE_STEP, ::COARSE_STEP] for view in views]
+        if root_mean_square(view_gains) < DIFFERENT:
             return scene
-        objection = _find_objection(scene, views, gains)
+        brightness = log(np.maximum([photo.mean((0, 1), dtype=np.float64) for photo in photos], 1 / 255))
+        objection = ""
+        if is_metered(brightness, view_gains):
+            objection = "this looks like automatic exposure (photos with larger factors are not brighter)"
+        elif share_unexpected(view_gains, camera_distances(scene.cameras[list(views)])) < UNEXPECTED:
+            objection = "neighbouring photos have nearly the same exposure, so new views between them have it, too"
         if objection:
             remedy = "--set exposure=per-photo brings them to their mean exposure"
             note(f"{differ}; photos stay unchanged, because {objection}; {remedy}")
@@ -91,20 +97,6 @@ def equalise_exposure(scene: PicturedScene, views: Sequence[int], exposure: Expo
     record_choices(exposure=factors.tolist())
     note(f"{differ}; photos are brought to their mean exposure")
     return _divide_by_gains(scene, factors)
-
-
-def _find_objection(scene: PicturedScene, views: Sequence[int], gains: np.ndarray) -> str:
-    """Return why photos should stay unchanged although their exposures differ; "" if there is no reason.
-
-    ``gains [v,3]`` are the logarithmic gains of ``views``.
-    """
-    view_gains, photos = gains[list(views)], [scene.images[view][::COARSE_STEP, ::COARSE_STEP] for view in views]
-    brightness = log(np.maximum([photo.mean((0, 1), dtype=np.float64) for photo in photos], 1 / 255))
-    if is_metered(brightness, view_gains):
-        return "this looks like automatic exposure (photos with larger factors are not brighter)"
-    if share_unexpected(view_gains, camera_distances(scene.cameras[list(views)])) < UNEXPECTED:
-        return "neighbouring photos have nearly the same exposure, so new views between them have it, too"
-    return ""
 
 
 def root_mean_square(gains: np.ndarray) -> float:
@@ -227,11 +219,11 @@ def _solve_gains(pairs: Sequence[_Pair], num_views: int) -> np.ndarray:
     return gains
 
 
-def _find_clipped(scene: PicturedScene, gains: np.ndarray) -> np.ndarray:
-    """Return a mask ``[v,h,w]`` of clipped pixels of brighter photos whose surface another photo shows unclipped.
+def _divide_by_gains(scene: PicturedScene, gains: np.ndarray) -> PicturedScene:
+    """Divide photos and colours of Gaussians by ``gains [v,3]``, which are factors of exposure.
 
-    ``gains [v,3]`` are factors of exposure. A surface that is clipped in all photos, such as a sky, is not marked,
-    because otherwise no photo would show it.
+    Clipped pixels of brighter photos are masked if another photo shows their surface unclipped. A surface that is
+    clipped in all photos, such as a sky, is not masked, because otherwise no photo would show it.
     """
     clipped = ((scene.images >= CLIPPED) & (gains[:, None, None] > BRIGHT_GAIN)).any(-1)
     pixels, flat = _pixels_of(scene), clipped.reshape(len(scene), -1)
@@ -246,17 +238,13 @@ def _find_clipped(scene: PicturedScene, gains: np.ndarray) -> np.ndarray:
             rows = rows[~is_shown[rows]]
         return is_shown
 
-    return np.stack(parallel_map(find_shown, range(len(scene)))).reshape(clipped.shape)
-
-
-def _divide_by_gains(scene: PicturedScene, gains: np.ndarray) -> PicturedScene:
-    """Divide photos and colours of Gaussians by ``gains [v,3]``; mask the pixels that :func:`_find_clipped` finds."""
+    masks = ~np.stack(parallel_map(find_shown, range(len(scene)))).reshape(clipped.shape)
+    if scene.masks is not None:
+        masks &= scene.masks
     factors = (1 / gains).astype(np.float32)
     levels = np.arange(256, dtype=np.float32) / np.float32(255)
     changes = [PhotoChange(tones=(factor[:, None] * levels).clip(0, 1)) for factor in factors]
-    images, masks = np.empty_like(scene.images), ~_find_clipped(scene, gains)
-    if scene.masks is not None:
-        masks &= scene.masks
+    images = np.empty_like(scene.images)
 
     def divide(view: int) -> None:
         images[view] = (scene.images[view] * factors[view]).clip(0, 1)

@@ -25,7 +25,7 @@ from gsmerge.raster.composite import blend_depths
 from gsmerge.raster.images import tile_views
 from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.types import Cameras, Gaussians, PicturedScene, fill_pixels
+from gsmerge.types import Gaussians, PicturedScene, fill_pixels
 
 # The numbers from HOLE_OPACITY to BARE were chosen on exports of eight captures as Depth Anything 3 writes them, and on
 # the same exports with shuffled and with merged rows
@@ -179,16 +179,42 @@ def _leave_empty(scene: PicturedScene, empty: np.ndarray) -> PicturedScene:
 
 
 def _fill_view(scene: PicturedScene, view: int, holes: np.ndarray, edges: _Edges) -> Gaussians:
-    """Make a Gaussian for each pixel of a view in the mask ``holes [h,w]``."""
-    cameras, shN = scene.cameras, scene.gaussians.shN
-    y, x = np.nonzero(holes)
-    pixels = np.stack([x + 0.5, y + 0.5, np.ones(len(x))], 1)
-    rays = matmul(matmul(pixels, invert(cameras.Ks[view]).T), cameras.viewmats[view, :3, :3])  # to depth 1
+    """Make a Gaussian for each pixel of a view in the mask ``holes [h,w]``.
+
+    The depth is chosen at which the nearest other views show the same colour. Differences of colours are averaged over
+    neighbouring holes. If no other view sees the points of a ray, the depth of the surface beside the hole is chosen.
+    """
+    cameras, centres, eye = scene.cameras, scene.cameras.centres, scene.cameras.centres[view]
+    rays = pixel_rays(holes, cameras.Ks[view], cameras.viewmats[view])
     edge_depths, far_depths = edges.beside.astype(np.float64), edges.farthest * FACTORS[:, None]
-    candidates = np.concatenate([edge_depths[None], np.maximum(far_depths, edge_depths)])
-    depth = _choose_depths(scene, view, holes, rays, candidates)
-    eye, size = cameras.centres[view], NEW_SIZE_PIXELS / cameras.Ks[view, 0, 0]
-    return make_round_gaussians(eye, rays, depth, size, scene.images[view][holes], shN.shape[1])
+    depths = np.concatenate([edge_depths[None], np.maximum(far_depths, edge_depths)])  # [d,n] candidates
+    # the point of a ray at a depth has the homogeneous pixel `start + depth * along` in another view
+    neighbors = [i for i in nearest_views(centres, view) if (centres[i] != eye).any()][:HOLE_NEIGHBORS]
+    projected = []
+    for neighbor in neighbors:
+        K, (rotation, translation) = cameras.Ks[neighbor], np.split(cameras.viewmats[neighbor, :3], [3], 1)
+        start = matmul(K, matmul(rotation, eye) + translation[:, 0])
+        projected.append((start, np.ascontiguousarray(matmul(matmul(rays, rotation.T), K.T).T)))
+    colors, pixels = scene.images[view][holes], np.flatnonzero(holes)
+    best_depths, best_costs = depths[0], np.full(len(rays), np.inf, np.float32)
+    min_gain = 0.001  # decrease in the difference of colours (sRGB) that each step to a farther depth has to bring
+    min_weight = 1e-3  # least weight, in the window of DIFFERENCE_BLUR, of pixels that other views see
+    for step, depth in enumerate(depths):
+        sums = np.zeros((*holes.shape, 2), np.float32)  # sums of differences, and numbers of differences
+        for neighbor, (start, along) in zip(neighbors, projected, strict=True):
+            add_differences(scene.images[neighbor], along, start, depth, colors, pixels, sums)
+        total, number = blur(sums, DIFFERENCE_BLUR).reshape(-1, 2)[pixels].T
+        cost = np.where(number > min_weight, total / np.maximum(number, min_weight), np.inf) + min_gain * step
+        best_depths, best_costs = np.where(cost < best_costs, depth, best_depths), np.minimum(cost, best_costs)
+    size = NEW_SIZE_PIXELS / cameras.Ks[view, 0, 0]
+    return make_round_gaussians(eye, rays, best_depths, size, colors, scene.gaussians.shN.shape[1])
+
+
+def pixel_rays(mask: np.ndarray, K: np.ndarray, viewmat: np.ndarray) -> np.ndarray:
+    """Return the vectors ``[n,3]``, in the world, from a camera to depth 1 on the rays of the pixels of ``mask``."""
+    y, x = np.nonzero(mask)
+    pixels = np.stack([x + 0.5, y + 0.5, np.ones(len(x))], 1)
+    return matmul(matmul(pixels, invert(K).T), viewmat[:3, :3])
 
 
 def make_round_gaussians(
@@ -206,38 +232,3 @@ def make_round_gaussians(
         sh0=rgb_to_sh0(colors)[:, None].astype(np.float32),
         shN=np.zeros((len(rays), num_higher, 3), np.float32),
     )
-
-
-def _choose_depths(
-    scene: PicturedScene, view: int, holes: np.ndarray, rays: np.ndarray, depths: np.ndarray
-) -> np.ndarray:
-    """Choose one of ``depths [d,n]`` for each of ``rays [n,3]``: where the nearest other views show the same colour.
-
-    Differences of colours are averaged over neighbouring ``holes [h,w]``. If no other view sees the points of a ray,
-    its first depth is chosen.
-    """
-    centres = scene.cameras.centres
-    neighbors = [i for i in nearest_views(centres, view) if (centres[i] != centres[view]).any()][:HOLE_NEIGHBORS]
-    neighbor_rays = [_rays_in(scene.cameras, neighbor, centres[view], rays) for neighbor in neighbors]
-    colors, pixels = scene.images[view][holes], np.flatnonzero(holes)
-    best_depths, best_costs = depths[0], np.full(len(rays), np.inf, np.float32)
-    min_gain = 0.001  # decrease in the difference of colours (sRGB) that each step to a farther depth has to bring
-    min_weight = 1e-3  # least weight, in the window of DIFFERENCE_BLUR, of pixels that other views see
-    for step, depth in enumerate(depths):
-        sums = np.zeros((*holes.shape, 2), np.float32)  # sums of differences, and numbers of differences
-        for neighbor, (start, along) in zip(neighbors, neighbor_rays, strict=True):
-            add_differences(scene.images[neighbor], along, start, depth, colors, pixels, sums)
-        total, number = blur(sums, DIFFERENCE_BLUR).reshape(-1, 2)[pixels].T
-        cost = np.where(number > min_weight, total / np.maximum(number, min_weight), np.inf) + min_gain * step
-        best_depths, best_costs = np.where(cost < best_costs, depth, best_depths), np.minimum(cost, best_costs)
-    return best_depths
-
-
-def _rays_in(cameras: Cameras, view: int, eye: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Project rays ``[n,3]`` from ``eye`` into a view; return the start ``[3]`` and directions ``[3,n]`` of the pixels.
-
-    The point of a ray at a depth has the homogeneous pixel ``start + depth * direction``.
-    """
-    K, (rotation, translation) = cameras.Ks[view], np.split(cameras.viewmats[view, :3], [3], 1)
-    start = matmul(K, matmul(rotation, eye) + translation[:, 0])
-    return start, np.ascontiguousarray(matmul(matmul(rays, rotation.T), K.T).T)

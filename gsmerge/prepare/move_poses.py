@@ -176,12 +176,26 @@ def _make_level(
         return np.stack([grey, right, down], -1), points, grey.ravel()[ids], rows.ravel()[ids], depth
 
     pictures, points, greys, ids, depths = zip(*parallel_map(sample_view, range(len(scene))), strict=True)
+    # The second view of a pair should show the greys of the first, plus the change of colour of the Gaussians from the
+    # first view to the second. Without this change, a highlight would look like a wrong pose, because it moves over its
+    # surface with the camera
+    g, eyes = scene.gaussians, scene.cameras.centres.astype(np.float32)
+    expected = np.zeros((len(pairs), max(map(len, greys))), np.float32)
+    for expected_greys, (first, second) in zip(expected, pairs, strict=True):
+        count = len(ids[first])
+        shown = [np.ascontiguousarray(column[ids[first]], np.float32) for column in (g.means, g.sh0, g.shN)]
+        shown.append(np.arange(count, dtype=np.int32))
+        first_colors, second_colors = np.empty((2, count, 3), np.float32)
+        view_colors(*shown, eyes[first], 0, count, first_colors)
+        view_colors(*shown, eyes[second], 0, count, second_colors)
+        changes = second_colors.clip(max=1) - first_colors.clip(max=1)  # photos show nothing brighter than 1
+        expected_greys[:count] = greys[first] + changes.mean(1)
     return _PhotoLevel(
         pictures=np.stack(pictures),
         Ks=photos.Ks.astype(np.float64),
         scale=scene.cameras.width / photos.width,
         points=np.concatenate(points),
-        greys=_expect_greys(scene, pairs, greys, ids),
+        greys=expected,
         starts=np.cumsum([0, *map(len, greys)]),
         depths=np.stack(depths),
         first_viewmats=scene.cameras.viewmats.astype(np.float64),
@@ -189,64 +203,35 @@ def _make_level(
     )
 
 
-def _expect_greys(
-    scene: PicturedScene, pairs: np.ndarray, greys: Sequence[np.ndarray], rows: Sequence[np.ndarray]
-) -> np.ndarray:
-    """Return the greys ``[p,m]`` that the second view of each pair should show at the sampled points of the first.
-
-    The expected greys are the ``greys`` of the first view, plus the change of colour of the Gaussians ``rows`` from the
-    first view to the second. Without this change, a highlight would look like a wrong pose, because it moves over its
-    surface with the camera.
-    """
-    g, eyes = scene.gaussians, scene.cameras.centres.astype(np.float32)
-    expected = np.zeros((len(pairs), max(map(len, greys))), np.float32)
-    for expected_greys, (first, second) in zip(expected, pairs, strict=True):
-        columns = [np.ascontiguousarray(values[rows[first]], np.float32) for values in (g.means, g.sh0, g.shN)]
-        ids = np.arange(len(rows[first]), dtype=np.int32)
-        first_colors, second_colors = np.empty((2, len(ids), 3), np.float32)
-        view_colors(*columns, ids, eyes[first], 0, len(ids), first_colors)
-        view_colors(*columns, ids, eyes[second], 0, len(ids), second_colors)
-        changes = second_colors.clip(max=1) - first_colors.clip(max=1)  # photos show nothing brighter than 1
-        expected_greys[: len(ids)] = greys[first] + changes.mean(1)
-    return expected
-
-
 def _improve_poses(level: _PhotoLevel, viewmats: np.ndarray, *, check: bool) -> tuple[np.ndarray, _Evidence]:
     """Improve poses by Gauss-Newton steps at one size; return the new poses, and the evidence at the new poses.
 
-    With ``check``, at most FIRST_STEPS steps are taken, and only one step if it shows that the poses are right.
+    Each step solves the normal equations of all pairs and of the prior. With ``check``, at most FIRST_STEPS steps are
+    taken, and only one step if it shows that the poses are right.
     """
     max_steps = FIRST_STEPS if check else POSE_STEPS
     right_px = 1.0  # poses are considered right if the first step moves all views by less than this, in pixels
     min_step = 1e-4  # a smaller step, in radians and canonical units, is the last
+    damping = 1e-3  # damping of the steps, relative to the curvature
+    prior = PRIOR * np.tile(np.repeat([1 / PRIOR_TURN**2, 1 / PRIOR_SHIFT**2], 3), len(viewmats))
     for step in range(max_steps + 1):
         evidence = _gather_evidence(level, viewmats)
         if step == max_steps or (check and step == 1 and _view_flows(level, evidence).max() < right_px):
             break
-        change = _solve_step(level, viewmats, evidence)
+        curvature, slope = np.diag(prior), prior * motion_vectors(level.first_viewmats, viewmats).ravel()
+        pairs = zip(level.pairs.tolist(), evidence.curvatures, evidence.slopes, strict=True)
+        for (view, other), pair_curvature, pair_slope in pairs:
+            a, b = slice(6 * view, 6 * view + 6), slice(6 * other, 6 * other + 6)  # the motions of both views
+            for rows, columns, sign in ((a, a, 1), (b, b, 1), (a, b, -1), (b, a, -1)):
+                curvature[rows, columns] += sign * pair_curvature
+            slope[a] -= pair_slope
+            slope[b] += pair_slope
+        curvature[np.diag_indices(len(curvature))] *= 1 + damping
+        change = -solve(curvature, slope).reshape(-1, 6)  # next motion of each view
         viewmats = matmul(viewmats, motion_matrices(change))
         if np.abs(change).max() < min_step:
             break
     return viewmats, evidence
-
-
-def _solve_step(level: _PhotoLevel, viewmats: np.ndarray, evidence: _Evidence) -> np.ndarray:
-    """Solve the normal equations of all pairs and of the prior for the next motion ``[v,6]`` of each view.
-
-    ``evidence`` is the evidence at the poses ``viewmats [v,4,4]``.
-    """
-    prior = PRIOR * np.tile(np.repeat([1 / PRIOR_TURN**2, 1 / PRIOR_SHIFT**2], 3), len(viewmats))
-    curvature, slope = np.diag(prior), prior * motion_vectors(level.first_viewmats, viewmats).ravel()
-    pairs = zip(level.pairs.tolist(), evidence.curvatures, evidence.slopes, strict=True)
-    for (view, other), pair_curvature, pair_slope in pairs:
-        a, b = slice(6 * view, 6 * view + 6), slice(6 * other, 6 * other + 6)  # the motions of both views
-        for rows, columns, sign in ((a, a, 1), (b, b, 1), (a, b, -1), (b, a, -1)):
-            curvature[rows, columns] += sign * pair_curvature
-        slope[a] -= pair_slope
-        slope[b] += pair_slope
-    damping = 1e-3  # damping of the steps, relative to the curvature
-    curvature[np.diag_indices(len(curvature))] *= 1 + damping
-    return -solve(curvature, slope).reshape(-1, 6)
 
 
 def _gather_evidence(level: _PhotoLevel, viewmats: np.ndarray) -> _Evidence:

@@ -9,13 +9,13 @@ import numpy as np
 
 from gsmerge.fit.outside import outside_cameras
 from gsmerge.geometry.transforms import motion_matrices, motion_vectors, nearest_views, normalize
-from gsmerge.geometry.views import concat_cameras, resize_cameras, take_rows
+from gsmerge.geometry.views import concat_cameras, take_rows
 from gsmerge.kernels.elementary import cos, power, sin
 from gsmerge.kernels.matrices import matmul
 from gsmerge.prepare.viewer import GOLDEN, find_viewer, spread_directions
 from gsmerge.raster import contributions, make_splats, render, tile_view
 from gsmerge.raster.images import thin_out
-from gsmerge.raster.photos import NEAR_PLANE, blank_photos
+from gsmerge.raster.photos import blank_photos
 from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians, PicturedScene, Scene
@@ -63,7 +63,18 @@ def add_views(scene: Scene, *, shown: bool = False, placed: str = NO_VIEWS) -> S
     ``placed`` is the note about cameras that are not placed at a viewer's place. Raises ValueError if no Gaussian is
     finite.
     """
-    scene = keep_finite(scene)
+    g = scene.gaussians
+    finite = np.ones(len(g), bool)
+    for array in vars(g).values():
+        is_finite = np.isfinite(array)
+        if not is_finite.all():  # rare; row by row the test takes ten times as long
+            finite &= is_finite.reshape(len(g), -1).all(1)
+    count = int((~finite).sum())
+    if count == len(g):
+        raise ValueError("expected at least one finite Gaussian, got none")
+    if count:
+        note(f"{count} Gaussians are not finite and were left out")
+        scene = take_rows(scene, np.flatnonzero(finite))
     if len(scene) == 0:
         inside = place_inside(scene.gaussians)
         note(placed if inside is None else VIEWER_VIEWS)
@@ -110,23 +121,6 @@ def _place_around_and_inside(gaussians: Gaussians) -> Cameras:
     return concat_cameras(around, inside)
 
 
-def keep_finite(scene: Scene) -> Scene:
-    """Return a scene of the finite Gaussians, with a note if some are left out; ValueError if no Gaussian is finite."""
-    g = scene.gaussians
-    finite = np.ones(len(g), bool)
-    for array in vars(g).values():
-        is_finite = np.isfinite(array)
-        if not is_finite.all():  # rare; row by row the test takes ten times as long
-            finite &= is_finite.reshape(len(g), -1).all(1)
-    count = int((~finite).sum())
-    if count == len(g):
-        raise ValueError("expected at least one finite Gaussian, got none")
-    if count:
-        note(f"{count} Gaussians are not finite and were left out")
-        scene = take_rows(scene, np.flatnonzero(finite))
-    return scene
-
-
 def place_around(gaussians: Gaussians, count: int = FITTED) -> Cameras:
     """Place cameras to which a scene without cameras is fitted, and on which results are scored.
 
@@ -136,15 +130,20 @@ def place_around(gaussians: Gaussians, count: int = FITTED) -> Cameras:
     means = thin_out(gaussians, CANDIDATE_GAUSSIANS).means.astype(np.float64)
     centre, half = _robust_box(means)
     outside = [_viewmats_around(centre, half, radii, spread_directions(count)) for radii in (FAR_RADII, NEAR_RADII)]
-    chosen, walk = place_cameras(gaussians, count), _viewmats_on_walk(np.median(means, axis=0), half, count // 2)
+    chosen, middle = place_cameras(gaussians, count), np.median(means, axis=0)
+    # the cameras of the walk look to all sides along the longest axis of the box
+    _, side, along = np.eye(3)[np.argsort(half, kind="stable")]
+    num_steps = count // 2
+    steps = 2 * (np.arange(num_steps) + 0.5) / num_steps - 1
+    angles = GOLDEN * np.arange(num_steps)
+    directions = cos(angles)[:, None] * along + sin(angles)[:, None] * side
+    walk_share = 0.6  # largest distance from the middle, as a share of the longest half axis
+    walk = [
+        _look_along(middle + step * walk_share * half.max() * along, direction)
+        for step, direction in zip(steps, directions, strict=True)
+    ]
     viewmats = np.concatenate([*outside, chosen.viewmats, walk])
     return replace(chosen, viewmats=viewmats, Ks=np.repeat(chosen.Ks[:1], len(viewmats), 0))
-
-
-def blank_pictures(scene: Scene) -> PicturedScene:
-    """Replace the photos by black pictures that take no memory."""
-    shape = len(scene), scene.cameras.height, scene.cameras.width, 3
-    return PicturedScene.with_pictures(scene, np.broadcast_to(np.float32(0), shape), None)
 
 
 def draw_pictures(scene: Scene) -> PicturedScene:
@@ -211,11 +210,17 @@ def place_cameras(gaussians: Gaussians, num_views: int = NUM_VIEWS) -> Cameras:
         raise ValueError("expected at least one Gaussian, got none")
     sample = thin_out(gaussians, CANDIDATE_GAUSSIANS)
     centre, half = _robust_box(sample.means.astype(np.float64))
-    viewmats = _candidate_viewmats(centre, half)
+    inside = [
+        _look_along(centre + position * half, direction)
+        for position in np.stack(np.meshgrid(INSIDE, INSIDE, INSIDE, indexing="ij"), -1).reshape(-1, 3)
+        for direction in spread_directions(INSIDE_DIRECTIONS)
+    ]
+    around = _viewmats_around(centre, half, FAR_RADII, spread_directions(AROUND_CAMERAS))
+    viewmats = np.concatenate([around, inside])
     candidates = Cameras(viewmats, np.repeat(_square_intrinsics(PROBE)[None], len(viewmats), 0), PROBE, PROBE)
-    shares = _shares_seen(sample, candidates, NEAR_PLANE_SHARE * float(np.sqrt((half * half).sum())))
     least_gain = 1e-3  # a camera is added if it raises the shown opacity by more than this share
-    best = _choose_candidates(shares, num_views, least_gain)
+    near = NEAR_PLANE_SHARE * float(np.sqrt((half * half).sum()))
+    best = choose_candidates(sample, candidates, near, least_gain, num_views)
     size = int(np.clip(round(math.sqrt(len(gaussians))), SMALLEST_PIXELS, LARGEST_PIXELS))
     return Cameras(viewmats[best], np.repeat(_square_intrinsics(size)[None], len(best), 0), size, size)
 
@@ -237,20 +242,6 @@ def _robust_box(means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return (low + high) / 2, np.maximum(half, 1e-3 * widest)
 
 
-def _candidate_viewmats(centre: np.ndarray, half: np.ndarray) -> np.ndarray:
-    """Return the world-to-camera matrices ``[c,4,4]`` of all candidates around and inside a box.
-
-    ``centre [3]`` is the centre of the box, and ``half [3]`` are half its sides.
-    """
-    grid = np.stack(np.meshgrid(INSIDE, INSIDE, INSIDE, indexing="ij"), -1).reshape(-1, 3)
-    inside = [
-        _look_along(centre + position * half, direction)
-        for position in grid
-        for direction in spread_directions(INSIDE_DIRECTIONS)
-    ]
-    return np.concatenate([_viewmats_around(centre, half, FAR_RADII, spread_directions(AROUND_CAMERAS)), inside])
-
-
 def _viewmats_around(centre: np.ndarray, half: np.ndarray, radii: float, directions: np.ndarray) -> np.ndarray:
     """Return world-to-camera matrices ``[c,4,4]`` of cameras that look at a box's centre from ``directions [c,3]``.
 
@@ -259,24 +250,6 @@ def _viewmats_around(centre: np.ndarray, half: np.ndarray, radii: float, directi
     """
     distance = radii * float(np.sqrt((half * half).sum()))
     return np.stack([_look_along(centre + distance * direction, -direction) for direction in directions])
-
-
-def _viewmats_on_walk(middle: np.ndarray, half: np.ndarray, count: int) -> np.ndarray:
-    """Return world-to-camera matrices ``[count,4,4]`` of cameras that look to all sides along a box's longest axis.
-
-    ``middle [3]`` is the centre of the box, and ``half [3]`` are half its sides.
-    """
-    _, side, along = np.eye(3)[np.argsort(half, kind="stable")]
-    steps = 2 * (np.arange(count) + 0.5) / count - 1
-    angles = GOLDEN * np.arange(count)
-    directions = cos(angles)[:, None] * along + sin(angles)[:, None] * side
-    walk_share = 0.6  # largest distance from the middle, as a share of the longest half axis
-    return np.stack(
-        [
-            _look_along(middle + step * walk_share * half.max() * along, direction)
-            for step, direction in zip(steps, directions, strict=True)
-        ]
-    )
 
 
 def _look_along(eye: np.ndarray, direction: np.ndarray) -> np.ndarray:
@@ -293,19 +266,19 @@ def _look_along(eye: np.ndarray, direction: np.ndarray) -> np.ndarray:
     return viewmat
 
 
-def choose_showing(sample: Gaussians, candidates: Cameras, counting: np.ndarray, least_added: float) -> list[int]:
-    """Choose candidates that show as much as possible of the Gaussians in the mask ``counting [n]`` of a sample.
+def choose_candidates(
+    sample: Gaussians,
+    candidates: Cameras,
+    near: float,
+    least_added: float,
+    num_views: int = NUM_VIEWS,
+    counting: np.ndarray | None = None,
+) -> list[int]:
+    """Choose one to ``num_views`` candidates, always the one that adds most to the opacity shown so far.
 
-    Each candidate must add more than the share ``least_added`` to the opacity shown so far. The sample is canonical.
-    """
-    shares = _shares_seen(sample, resize_cameras(candidates, PROBE, PROBE), NEAR_PLANE)
-    return _choose_candidates(shares[:, counting], NUM_VIEWS, least_added)
-
-
-def _shares_seen(sample: Gaussians, candidates: Cameras, near: float) -> np.ndarray:
-    """Return the part of each Gaussian's opacity that each candidate shows, ``[c,n]`` float32.
-
-    ``near`` is the depth of the near plane.
+    The candidates show a sample of the Gaussians, of which only those in the mask ``counting [n]`` count, by default
+    all. ``near`` is the depth of the near plane. The choice ends when no other candidate would add more than the share
+    ``least_added``.
     """
     splats, photos = make_splats(sample), blank_photos(candidates)
 
@@ -315,22 +288,15 @@ def _shares_seen(sample: Gaussians, candidates: Cameras, near: float) -> np.ndar
         seen_weight = 1.0  # blending weight, summed over pixels, at which a Gaussian counts as seen
         return np.minimum(sums / np.float32(seen_weight), 1) * splats.opacities
 
-    return np.stack(parallel_map(view_shares, range(len(candidates))))
-
-
-def _choose_candidates(shares: np.ndarray, num_views: int, least_added: float) -> list[int]:
-    """Choose one to ``num_views`` candidates, always the one that adds most to the opacity shown so far.
-
-    ``shares [c,n]`` is the result of :func:`_shares_seen`. The choice ends when no other candidate would add more than
-    the share ``least_added``.
-    """
-    seen = np.zeros(shares.shape[1], np.float32)
-    candidates: list[int] = []
+    shares = np.stack(parallel_map(view_shares, range(len(candidates))))  # [c,n]
+    if counting is not None:
+        shares = shares[:, counting]
+    seen, chosen = np.zeros(shares.shape[1], np.float32), list[int]()
     for _ in range(num_views):
         gains = np.maximum(shares - seen, 0).sum(1, dtype=np.float64)
         best = int(gains.argmax())
-        if candidates and gains[best] <= least_added * seen.sum(dtype=np.float64):
+        if chosen and gains[best] <= least_added * seen.sum(dtype=np.float64):
             break
-        candidates.append(best)
+        chosen.append(best)
         np.maximum(seen, shares[best], out=seen)
-    return candidates
+    return chosen

@@ -21,7 +21,6 @@ from gsmerge.prepare.place_cameras import (
     NO_VIEWS,
     VIEWER_VIEWS,
     add_views,
-    blank_pictures,
     draw_around,
     draw_pictures,
     place_inside,
@@ -160,7 +159,13 @@ def prepare(
         if agreement.advice:
             note(agreement.advice)
     if fill and reference.of_views:
-        scene, reference = _without_holes(scene, reference, options)
+        views, shown = reference.score_views, np.zeros(scene.images.shape[:3], bool)
+        has_row_colors = reference.name == ROW_COLORS  # these pictures have colours at all pixels
+        shown[list(views)] = True if has_row_colors or scene.masks is None else scene.masks[list(views)]
+        scene = fill_holes(scene, shown, everywhere=options.extent == "photos")
+        if scene.empty is not None and scene.masks is not None:  # views that count nowhere any more are not scored
+            seen = tuple(view for view in views if scene.masks[view].any())
+            reference = replace(reference, score_views=seen or views)
     if outside and not scene.has_own_pixels and not placed:
         drawn = draw_outside(scene)
         if reference.name == RENDERS and drawn is not scene:  # all pixels of all pictures are drawings
@@ -188,7 +193,7 @@ def choose_pictures(scene: Scene, look: Look, *, placed: bool) -> tuple[Pictured
     remedy = "" if has_photos else "; name photos with --images"
     if not placed:  # if views were placed, another note has said this
         note(f"{reason}: renders of the scene itself are used instead{remedy}")
-    drawn, scored = draw_pictures(blank_pictures(scene)), every[: len(every) // HELD_OUT] if placed else every
+    drawn, scored = draw_pictures(scene), every[: len(every) // HELD_OUT] if placed else every
     shown = tuple(view for view in scored if drawn.images[view].any())  # any result is right in an empty view
     return drawn, Reference(RENDERS, shown or scored, placed)
 
@@ -206,23 +211,6 @@ def _has_changed(photos: np.ndarray, scene: PicturedScene, views: Sequence[int],
         for before, view in zip(photos, repeated, strict=True)
         if view in views
     )
-
-
-def _without_holes(
-    scene: PicturedScene, reference: Reference, options: PrepareOptions
-) -> tuple[PicturedScene, Reference]:
-    """Add Gaussians at pixels that pictures show and no Gaussian covers; see :func:`fill_holes`.
-
-    A view is no longer scored if all of its pixels stay empty.
-    """
-    views, shown = reference.score_views, np.zeros(scene.images.shape[:3], bool)
-    has_row_colors = reference.name == ROW_COLORS  # these pictures have colours at all pixels
-    shown[list(views)] = True if has_row_colors or scene.masks is None else scene.masks[list(views)]
-    filled = fill_holes(scene, shown, everywhere=options.extent == "photos")
-    if filled.empty is not None and filled.masks is not None:
-        seen = tuple(view for view in views if filled.masks[view].any())
-        reference = replace(reference, score_views=seen or views)
-    return filled, reference
 
 
 def without_repeats(scene: Scene) -> tuple[Scene, list[int], list[str]]:

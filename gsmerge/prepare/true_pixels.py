@@ -90,11 +90,33 @@ def find_pixels(scene: Scene) -> Pixels:
     g, cameras, count = scene.gaussians, scene.cameras, len(scene)
     means, scales, opacities = (np.ascontiguousarray(column, np.float32) for column in (g.means, g.scales, g.opacities))
     viewmats, Ks = (np.ascontiguousarray(array, np.float64) for array in (cameras.viewmats, cameras.Ks))
-    fronts = np.empty((count, cameras.height, cameras.width), np.int32)
+    height, width = cameras.height, cameras.width
+    fronts = np.empty((count, height, width), np.int32)
     best_weights, homes = np.zeros(len(g), np.float32), np.full(len(g), -1, np.int64)
 
     def weigh(view: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        return _weigh_view(means, scales, opacities, viewmats[view], Ks[view], fronts[view])
+        """Fill the fronts of a view; return the rows ``[m]`` of its Gaussians, their pixels and their weights."""
+        shape = height, width
+        ids, pixels, depths, areas = project_centres(means, scales, viewmats[view], Ks[view], width, height, NEAR_PLANE)
+        if len(ids) == 0:
+            fronts[view] = -1
+            return ids, pixels, areas
+        inside, shown = areas > 0, np.zeros(shape, bool)
+        shown.reshape(-1)[pixels[inside]] = True
+        some_areas = areas[:: max(1, len(areas) // ESTIMATE_GAUSSIANS)]
+        level = choose_level(shown, SHOWN_WIDTH * float(np.sqrt(np.median(np.abs(some_areas)))))
+        # first the fronts of all cells, then the fronts of pixels from the Gaussians on the surface of their cell
+        order, (cells, cells_shape) = depth_order(depths), _cells_of(pixels, shape, level)
+        grid_fronts = np.empty(cells_shape, np.int32)
+        weights = weigh_centres(order, ids, cells, areas, opacities, grid_fronts)  # fills `grid_fronts`
+        cell_fronts = grid_fronts.reshape(-1)
+        front_depths = depths[np.searchsorted(ids, cell_fronts).clip(max=len(ids) - 1)]
+        max_depths = SAME_DEPTH * np.where(cell_fronts >= 0, front_depths, np.inf)
+        on_surface = (depths <= max_depths[cells])[order]
+        weigh_centres(order[on_surface], ids, pixels, areas, opacities, fronts[view])  # fills `fronts`
+        pixel_cells, _ = _cells_of(np.arange(height * width, dtype=np.int32), shape, level)
+        np.copyto(fronts[view], cell_fronts[pixel_cells].reshape(shape), where=fronts[view] < 0)
+        return ids, pixels, weights
 
     weighed = in_turn(weigh, range(count)) if len(g) <= ONE_AT_A_TIME else map(weigh, range(count))
     for view, (ids, pixels, weights) in enumerate(weighed):
@@ -102,38 +124,6 @@ def find_pixels(scene: Scene) -> Pixels:
         ids = ids[is_better]
         best_weights[ids], homes[ids] = weights[is_better], view * scene.pixels_per_view + pixels[is_better]
     return Pixels(homes, fronts, own=False)
-
-
-def _weigh_view(
-    means: np.ndarray, scales: np.ndarray, opacities: np.ndarray, viewmat: np.ndarray, K: np.ndarray, fronts: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Weigh the Gaussians of one view in the cells of the view, and fill ``fronts [h,w]`` with the front of each pixel.
-
-    Returns the rows ``[m]`` of the Gaussians that the view sees, their pixels ``[m]``, and their weights ``[m]`` in
-    pixels. The view has the camera ``viewmat [4,4]``, ``K [3,3]``.
-    """
-    height, width = fronts.shape
-    ids, pixels, depths, areas = project_centres(means, scales, viewmat, K, width, height, NEAR_PLANE)
-    if len(ids) == 0:
-        fronts[:] = -1
-        return ids, pixels, areas
-    inside, shown = areas > 0, np.zeros(fronts.shape, bool)
-    shown.reshape(-1)[pixels[inside]] = True
-    level = choose_level(
-        shown, SHOWN_WIDTH * float(np.sqrt(np.median(np.abs(areas[:: max(1, len(areas) // ESTIMATE_GAUSSIANS)]))))
-    )
-    # first the fronts of all cells, then the fronts of pixels from the Gaussians on the surface of their cell
-    order, (cells, shape) = depth_order(depths), _cells_of(pixels, fronts.shape, level)
-    grid_fronts = np.empty(shape, np.int32)
-    weights = weigh_centres(order, ids, cells, areas, opacities, grid_fronts)  # fills `grid_fronts`
-    cell_fronts = grid_fronts.reshape(-1)
-    front_depths = depths[np.searchsorted(ids, cell_fronts).clip(max=len(ids) - 1)]
-    max_depths = SAME_DEPTH * np.where(cell_fronts >= 0, front_depths, np.inf)
-    on_surface = (depths <= max_depths[cells])[order]
-    weigh_centres(order[on_surface], ids, pixels, areas, opacities, fronts)  # fills `fronts`
-    pixel_cells, _ = _cells_of(np.arange(fronts.size, dtype=np.int32), fronts.shape, level)
-    np.copyto(fronts, cell_fronts[pixel_cells].reshape(fronts.shape), where=fronts < 0)
-    return ids, pixels, weights
 
 
 def choose_level(shown: np.ndarray, widest: float) -> int:

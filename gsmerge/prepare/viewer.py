@@ -44,9 +44,16 @@ def find_viewer(gaussians: Gaussians) -> Viewer | None:
     means, sizes = gaussians.means.astype(np.float64), np.sort(gaussians.scales, 1)[:, 1].astype(np.float64)
     if not sizes.all() or _spread_of_logs(sizes) == 0:
         return None
+    # The search has two starts: the middle of the smaller Gaussians, which are nearer, and a direct solution. The
+    # direct solution is the place x = -b / 2a at which the function size^2 = a |x|^2 + b x + c, fitted with equal
+    # relative errors, is least
     order = np.argsort(sizes, kind="stable")
-    # the search has two starts: the middle of the smaller Gaussians, which are nearer, and a direct solution
-    starts = np.median(means[order[: (len(means) + 1) // 2]], 0), _solve_squares(means, sizes)
+    rows = np.concatenate([(means**2).sum(1, keepdims=True), means, np.ones((len(means), 1))], 1) / sizes[:, None] ** 2
+    units = np.sqrt((rows**2).mean(0))
+    units[units == 0] = 1
+    rows /= units
+    squares = solve_symmetric(matmul(rows.T, rows), rows.sum(0)) / units
+    starts = np.median(means[order[: (len(means) + 1) // 2]], 0), -squares[1:4] / (2 * squares[0] or 1)
     solutions = [_solve_place(means, sizes, start) for start in starts]
     least = min(error for _, error in solutions)
     likely = [_look_around(means, place) for place, error in solutions if error <= LIKELY * least]
@@ -83,19 +90,6 @@ def _solve_place(means: np.ndarray, sizes: np.ndarray, place: np.ndarray) -> tup
         weighted = (slopes * robust_weights(np.abs(errors), doubt_factor, least_error)[:, None]).T
         place = place - solve_symmetric(matmul(weighted, slopes), matmul(weighted, errors))[:3]
     return place, error
-
-
-def _solve_squares(means: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """Return the place ``[3]`` at which a quadratic function of the means, fitted to squared sizes, is least.
-
-    The function is size^2 = a |x|^2 + b x + c, fitted with equal relative errors. The function is least at x = -b / 2a.
-    """
-    rows = np.concatenate([(means**2).sum(1, keepdims=True), means, np.ones((len(means), 1))], 1) / sizes[:, None] ** 2
-    units = np.sqrt((rows**2).mean(0))
-    units[units == 0] = 1
-    rows /= units
-    solution = solve_symmetric(matmul(rows.T, rows), rows.sum(0)) / units
-    return -solution[1:4] / (2 * solution[0] or 1)
 
 
 def _spread_of_logs(values: np.ndarray) -> float:

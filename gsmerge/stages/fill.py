@@ -15,9 +15,8 @@ import numpy as np
 
 from gsmerge.fit.outside import Outside
 from gsmerge.geometry.transforms import is_inside, project
-from gsmerge.kernels.matrices import invert, matmul
 from gsmerge.kernels.pictures import blur
-from gsmerge.prepare.fill_holes import NEW_SIZE_PIXELS, make_round_gaussians
+from gsmerge.prepare.fill_holes import NEW_SIZE_PIXELS, make_round_gaussians, pixel_rays
 from gsmerge.prepare.place_cameras import between_cameras
 from gsmerge.prepare.row_colors import fill_gaps
 from gsmerge.raster import Splats, TiledView, make_splats, tile_view
@@ -179,7 +178,7 @@ def _continue_surfaces(
     view of all photos.
     """
     gaps, surface_depths, colors = _spread_into_gaps(drawing, round(WINDOW_SHARE * camera.width), beyond=beyond)
-    eye, rays = camera.centres[0], _rays(gaps, camera)
+    eye, rays = camera.centres[0], pixel_rays(gaps, camera.Ks[0], camera.viewmats[0])
     depths = np.array(DEPTH_FACTORS)[:, None] * surface_depths.astype(np.float64)
     points = (eye + depths[..., None] * rays).reshape(-1, 3)
     wrong = np.zeros(len(points), bool) if beyond else ~seen[0].show(points)
@@ -217,10 +216,3 @@ def _spread_into_gaps(
     sums = blur(fill_gaps(values, far) * (filled | far)[..., None], blur_pixels)[filled]
     inverse_depths, colors, weights = sums[:, 0], sums[:, 1:4], sums[:, 4]
     return filled, weights / inverse_depths, colors / weights[:, None]
-
-
-def _rays(mask: np.ndarray, camera: Cameras) -> np.ndarray:
-    """Return the vectors ``[n,3]``, in the world, from the camera to depth 1 on the rays of the pixels of ``mask``."""
-    y, x = np.nonzero(mask)
-    pixels = np.stack([x + 0.5, y + 0.5, np.ones(len(x))], 1)
-    return matmul(matmul(pixels, invert(camera.Ks[0]).T), camera.viewmats[0][:3, :3])
