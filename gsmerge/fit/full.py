@@ -16,6 +16,7 @@ from gsmerge.fit.averages import RecentMean, TailMean
 from gsmerge.fit.edges import cut_state, split_at_edges
 from gsmerge.fit.fit_state import FitState, gaussians_of, start_state, state_of
 from gsmerge.fit.growth import FAINT, drop_faint, grow_to
+from gsmerge.fit.outside import veil_gradients
 from gsmerge.fit.report import FitReport, FitResult
 from gsmerge.fit.schedule import CLEARS, CUTS, GROWTH, FitRun, Schedule
 from gsmerge.fit.steps import Optimiser, make_optimiser
@@ -34,7 +35,8 @@ def fit_full(
 ) -> FitResult:
     """Fit all parameters of Gaussians to the photos of a run.
 
-    Held-out patches are scored once the first steps are done. The remaining steps use every patch.
+    Held-out patches are scored once the first steps are done. The remaining steps use every patch. After the last step,
+    Gaussians are split at the edges of the views if the photos hardly suffer.
 
     Args:
         gaussians: The n Gaussians to start from.
@@ -45,16 +47,44 @@ def fit_full(
     Returns:
         The fitted Gaussians and a report.
     """
-    fit = start_fit(gaussians, run, survey, fixed)
+    job = run.job
+    survey = survey_photos(gaussians, run) if survey is None else survey
+    fit = FullFit(run, make_optimiser(run), Schedule(run), start_state(gaussians), survey.score, job.options.steps)
+    fit.state.box_shares[:], fit.state.min_sizes[:] = limit_moves(survey, job.options.tuning)
+    if fixed is not None:
+        fit.state.fixed[:] = fixed
     while fit.step < fit.steps:
         if fit.progress >= run.half_part:  # before Gaussians are split, because new halves score worse
             score_fit(fit)
         renew_state(fit)
         take_step(fit)
-        if run.job.progress:
-            run.job.progress(fit.step, fit.steps, decibels(fit.error.mean), run.half_part)
+        if job.progress:
+            job.progress(fit.step, fit.steps, decibels(fit.error.mean), run.half_part)
     score_fit(fit)
-    return end_fit(fit)
+    final = state_of(fit.tail.of(fit.state.x), fit.state.splats.shN)
+    final.origins, final.min_sizes = fit.state.origins, fit.state.min_sizes
+    # A fit that fills an exact number of Gaussians has no room for halves. There are no edges if renders stand for
+    # photos, because renders also show what lies beyond the edges of photos
+    has_room = job.options.grows and not job.options.fills
+    if has_room and job.edges is not None and job.fixed is None:
+        split = split_at_edges(final, job.edges, job.count)
+        if split is not final:
+            mse, split_mse = (
+                float(photo_mses(gaussians_of(s.x, s.splats.shN), fit.half).mean()) for s in (final, split)
+            )
+            # photos may lose .5 dB where large Gaussians overlap, because two halves cover more than their parent
+            final = split if split_mse <= SPLIT_LOSS * mse else final
+    report = FitReport(
+        method="full",
+        accepted=True,
+        steps=fit.step,
+        holdout_before=fit.before,
+        holdout_after=fit.before if fit.after is None else fit.after,
+        stopped="all steps done",
+        viewmats=fit.optimiser.viewmats,
+        origins=final.origins,
+    )
+    return gaussians_of(final.x, final.splats.shN), report
 
 
 @dataclass(eq=False)
@@ -86,16 +116,6 @@ class FullFit:
     def reaches(self, *milestones: float) -> bool:
         """Return true if the next step is the first after one of the ``milestones``, which are values of `progress`."""
         return any(self.last < milestone <= self.progress for milestone in milestones)
-
-
-def start_fit(gaussians: Gaussians, run: FitRun, survey: Survey | None, fixed: np.ndarray | None) -> FullFit:
-    """Return a full fit before its first step."""
-    state, optimiser = start_state(gaussians), make_optimiser(run)
-    if fixed is not None:
-        state.fixed[:] = fixed
-    survey = survey_photos(gaussians, run) if survey is None else survey
-    state.box_shares[:], state.min_sizes[:] = limit_moves(survey, run.job.options.tuning)
-    return FullFit(run, optimiser, Schedule(run), state, survey.score, run.job.options.steps)
 
 
 def score_fit(fit: FullFit) -> None:
@@ -131,41 +151,13 @@ def take_step(fit: FullFit) -> None:
     fit.error.add(fit.optimiser.step(fit.state, step))
     outside_view = run.outside_view(step.number, progress)
     if outside_view is not None:
-        fit.optimiser.clear_veils(fit.state, step, outside_view)
+        assert run.job.outside is not None
+        fit.optimiser.move(fit.state, veil_gradients(fit.state.splats, run.job.outside, outside_view), step)
     if run.job.region is not None:
         fit.state.keep_inside(run.job.region)
     fit.step, fit.last = step.number, progress
     if fit.step > fit.steps * (1 - run.job.options.tuning.average_share):
         fit.tail.add(fit.state.x)
-
-
-def end_fit(fit: FullFit) -> FitResult:
-    """Return the fitted Gaussians, split at the edges of the views if the photos hardly suffer, and a report."""
-    job = fit.run.job
-    final = state_of(fit.tail.of(fit.state.x), fit.state.splats.shN)
-    final.origins, final.min_sizes = fit.state.origins, fit.state.min_sizes
-    # A fit that fills an exact number of Gaussians has no room for halves. There are no edges if renders stand for
-    # photos, because renders also show what lies beyond the edges of photos
-    has_room = job.options.grows and not job.options.fills
-    if has_room and job.edges is not None and job.fixed is None:
-        split = split_at_edges(final, job.edges, job.count)
-        if split is not final:
-            mse, split_mse = (
-                float(photo_mses(gaussians_of(s.x, s.splats.shN), fit.half).mean()) for s in (final, split)
-            )
-            # photos may lose .5 dB where large Gaussians overlap, because two halves cover more than their parent
-            final = split if split_mse <= SPLIT_LOSS * mse else final
-    report = FitReport(
-        method="full",
-        accepted=True,
-        steps=fit.step,
-        holdout_before=fit.before,
-        holdout_after=fit.before if fit.after is None else fit.after,
-        stopped="all steps done",
-        viewmats=fit.optimiser.viewmats,
-        origins=final.origins,
-    )
-    return gaussians_of(final.x, final.splats.shN), report
 
 
 def limit_moves(survey: Survey, rates: Tuning) -> tuple[np.ndarray, np.ndarray]:

@@ -62,7 +62,15 @@ def grow(state: FitState, masses: np.ndarray, count: int) -> tuple[FitState, np.
     if num <= 0:
         return state, masses
     worst = np.sort(np.argsort(-masses, kind="stable")[:num])
-    first_halves, second_halves = split_parameters(state.x[worst])
+    first_halves = state.x[worst]
+    rows, longest = np.arange(num), first_halves[:, SIZE:QUAT].argmax(1)
+    distances = OFFSET * exp(first_halves[rows, SIZE + longest])
+    shift = quat_to_rotmat(first_halves[:, QUAT:LOGIT])[rows, :, longest] * distances[:, None]
+    first_halves[rows, SIZE + longest] += 0.5 * log(1 - OFFSET**2)  # so both halves together are as long as the parent
+    first_halves[:, LOGIT] = fade_halves(first_halves[:, LOGIT])
+    second_halves = first_halves.copy()
+    first_halves[:, :SIZE] -= shift
+    second_halves[:, :SIZE] += shift
     x = np.concatenate([state.x, second_halves])
     x[worst] = first_halves
     parents = np.concatenate([np.arange(len(state.x)), worst])
@@ -77,21 +85,6 @@ def grow(state: FitState, masses: np.ndarray, count: int) -> tuple[FitState, np.
     masses = masses[parents]
     masses[is_half] /= 2
     return grown, masses
-
-
-def split_parameters(parents: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Split Gaussians with parameters ``[m,14]`` across their longest axes; return the parameters of both halves."""
-    rows, longest = np.arange(len(parents)), parents[:, SIZE:QUAT].argmax(1)
-    distances = OFFSET * exp(parents[rows, SIZE + longest])
-    rotations = quat_to_rotmat(parents[:, QUAT:LOGIT])
-    shift = rotations[rows, :, longest] * distances[:, None]
-    halves = parents.copy()
-    halves[rows, SIZE + longest] += 0.5 * log(1 - OFFSET**2)  # so both halves together are as long as the parent
-    halves[:, LOGIT] = fade_halves(halves[:, LOGIT])
-    first_halves, second_halves = halves, halves.copy()
-    first_halves[:, :SIZE] -= shift
-    second_halves[:, :SIZE] += shift
-    return first_halves, second_halves
 
 
 def fade_halves(logits: np.ndarray) -> np.ndarray:

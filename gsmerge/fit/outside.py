@@ -99,38 +99,26 @@ def place_outside_views(scene: Scene, start: Gaussians, photos: Photos, options:
     cameras = Cameras(photos.viewmats, photos.Ks, photos.width, photos.height)
     points = sample.means[:: max(1, len(sample) // DEPTH_GAUSSIANS)]
     placed = outside_cameras(points, cameras, min(num_steps, max(PLACES, len(photos))), STEP_BACK_LOW, STEP_BACK_HIGH)
-    near, far = _depth_range(points, cameras, len(placed))
-    views = blank_photos(placed, min(OUTSIDE_LEVEL, photos.width / LEAST_WIDTH))
-    limits = _find_limits(make_splats(sample), views, near, far)
-    fog_weight = np.float32(np.clip(len(start) / (MANY_PER_PHOTO * len(photos)), LEAST_FOG_WEIGHT, 1.0))
-    weights = fog_weight * np.where(np.isinf(limits), 1, np.where(limits > 0, VEIL_WEIGHT, 0)).astype(np.float32)
-    min_share = 0.005  # a picture counts if more than min_share of its pixels are empty or solid
-    ids = np.flatnonzero((limits > 0).mean((1, 2)) > min_share).tolist()
-    return Outside(replace(views[ids], weights=weights[ids]), limits[ids], near[ids], far[ids]) if ids else None
+    # the depths of a view are the depths of points in the camera from which it steps back, each of `cameras` in turn
+    depths = [depths_inside(points, cameras[[view]]) for view in range(min(len(placed), len(cameras)))]
+    ranges = [quantiles(view_depths, (0.5, FAR_QUANTILE)) for view_depths in depths]
+    median, farthest = np.resize(ranges, (len(placed), 2)).T
+    near, far = OUTSIDE_NEAR_PLANE * median, FAR_FACTOR * farthest
+    views, splats = blank_photos(placed, min(OUTSIDE_LEVEL, photos.width / LEAST_WIDTH)), make_splats(sample)
 
-
-def _depth_range(points: np.ndarray, cameras: Cameras, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the depth of the near plane and the largest depth of each of ``count`` views from outside.
-
-    The depths of a view are the depths of ``points [n,3]`` in the camera from which the view steps back. Views step
-    back from each of ``cameras`` in turn.
-    """
-    depths = [depths_inside(points, cameras[[view]]) for view in range(min(count, len(cameras)))]
-    median, far = np.resize([quantiles(view_depths, (0.5, FAR_QUANTILE)) for view_depths in depths], (count, 2)).T
-    return OUTSIDE_NEAR_PLANE * median, FAR_FACTOR * far
-
-
-def _find_limits(splats: Splats, views: Photos, near: np.ndarray, far: np.ndarray) -> np.ndarray:
-    """Draw the Gaussians of the input in v views from outside; return the limits ``[v,h,w]`` of :class:`Outside`."""
-
-    def view_limits(view: int) -> np.ndarray:
+    def find_limits(view: int) -> np.ndarray:
         """Return the depth of the surface in each pixel, inf for empty pixels, and 0 for partly transparent pixels."""
         depths, transmittance = blend_depths(tile_view(splats, **views.camera(view), near=near[view]), far[view])
         opacities = 1 - transmittance
         limits = np.where(opacities > SOLID_OPACITY, depths, 0)
         return np.where(mark_empty(opacities), np.inf, limits).astype(np.float32)
 
-    return np.stack(list(in_turn(view_limits, range(len(views)))))
+    limits = np.stack(list(in_turn(find_limits, range(len(views)))))
+    fog_weight = np.float32(np.clip(len(start) / (MANY_PER_PHOTO * len(photos)), LEAST_FOG_WEIGHT, 1.0))
+    weights = fog_weight * np.where(np.isinf(limits), 1, np.where(limits > 0, VEIL_WEIGHT, 0)).astype(np.float32)
+    min_share = 0.005  # a picture counts if more than min_share of its pixels are empty or solid
+    ids = np.flatnonzero((limits > 0).mean((1, 2)) > min_share).tolist()
+    return Outside(replace(views[ids], weights=weights[ids]), limits[ids], near[ids], far[ids]) if ids else None
 
 
 def sample_gaussians(scene: Scene, count: int) -> Gaussians:

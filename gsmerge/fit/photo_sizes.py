@@ -111,41 +111,34 @@ def large_photos(scene: Scene, scale: float) -> Photos:
 def training_weights(photos: Photos, share: float, seed: int) -> list[np.ndarray]:
     """Return the weights ``[h,w]`` float32 of the pixels of each view in training: 0 on held-out patches.
 
-    The share ``share`` of the patches is held out. Outside of held-out patches, pixels have the weights of the photo.
+    The share ``share`` of the patches is held out. If several patches of a photo have pixels that count, at least one
+    of these patches is held out. Outside of held-out patches, pixels have the weights of the photo.
     Pixels with a weight below 1 are not held out, and a weight of 0 is replaced by ``HIDDEN_WEIGHT``.
     """
-    return [training_weight(photos, view, share, seed) for view in range(len(photos))]
-
-
-def training_weight(photos: Photos, view: int, share: float, seed: int) -> np.ndarray:
-    """Return the training weights ``[h,w]`` float32 of one view; see :func:`training_weights`.
-
-    If several patches of the photo have pixels that count, at least one of these patches is held out.
-    """
     size = max(1, min(PATCH_PIXELS, min(photos.height, photos.width) // 4))
-    rows, columns = -(-photos.height // size), -(-photos.width // size)
-    random = np.random.default_rng([seed, view])
-    counting = np.ones((rows, columns), bool) if photos.weights is None else _counting_patches(photos, view, size)
-    held_out = (random.random((rows, columns)) < share) & counting
-    if counting.any() and not held_out.any():  # hold out a random patch, unless it is the only one
-        candidates = np.argwhere(counting)  # [p,2] row and column of patches
-        patch = (random.integers(rows), random.integers(columns)) if counting.all() else random.choice(candidates)
-        held_out[tuple(patch)] = len(candidates) > 1
-    in_training = np.repeat(np.repeat(~held_out, size, 0), size, 1)[: photos.height, : photos.width]
-    if photos.weights is None:
-        return in_training.astype(np.float32)
-    weights = photos.weights[view]
-    return np.where(weights == 1, in_training.astype(np.float32), np.maximum(weights, HIDDEN_WEIGHT))
-
-
-def _counting_patches(photos: Photos, view: int, size: int) -> np.ndarray:
-    """Return a mask ``[r,c]`` of the patches of ``size`` pixels in which a pixel of weight 1 shows the scene."""
-    assert photos.weights is not None
-    counts = photos.weights[view] == 1
-    if photos.empty is not None:
-        counts &= photos.empty[view] == 0
-    rows, columns = (np.arange(0, side, size) for side in counts.shape)
-    return np.asarray(np.logical_or.reduceat(np.logical_or.reduceat(counts, rows, 0), columns, 1))
+    shape = -(-photos.height // size), -(-photos.width // size)
+    training_weights = []
+    for view in range(len(photos)):
+        random = np.random.default_rng([seed, view])
+        counting = np.ones(shape, bool)  # patches in which a pixel of weight 1 shows the scene
+        if photos.weights is not None:
+            counts = photos.weights[view] == 1
+            if photos.empty is not None:
+                counts &= photos.empty[view] == 0
+            rows, columns = (np.arange(0, side, size) for side in counts.shape)
+            counting = np.logical_or.reduceat(np.logical_or.reduceat(counts, rows, 0), columns, 1)
+        held_out = (random.random(shape) < share) & counting
+        if counting.any() and not held_out.any():  # hold out a random patch, unless it is the only one
+            candidates = np.argwhere(counting)  # [p,2] row and column of patches
+            patch = [random.integers(side) for side in shape] if counting.all() else random.choice(candidates)
+            held_out[tuple(patch)] = len(candidates) > 1
+        in_training = np.repeat(np.repeat(~held_out, size, 0), size, 1)[: photos.height, : photos.width]
+        weights = in_training.astype(np.float32)
+        if photos.weights is not None:
+            given = photos.weights[view]
+            weights = np.where(given == 1, weights, np.maximum(given, HIDDEN_WEIGHT))
+        training_weights.append(weights)
+    return training_weights
 
 
 def reduced(weights: list[np.ndarray], photos: Photos) -> list[np.ndarray]:

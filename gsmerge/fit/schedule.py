@@ -152,7 +152,17 @@ class FitRun:
 def prepare_fit(job: FitJob) -> FitRun:
     """Prepare a fit: choose held-out patches, the weights of pixels, the dropout, and how the first steps draw."""
     photos, options = job.photos, job.options
-    dropout = default_dropout(options.steps, len(photos[0])) if options.dropout is None else options.dropout
+    num_photos, steps, dropout = len(photos[0]), options.steps, options.dropout
+    if dropout is None:
+        dropout = LONG_DROPOUT if steps >= max(LONG_STEPS, LONG_ROUNDS * num_photos) else 0.0
+        if num_photos <= FEW_VIEWS and steps >= MANY_STEPS:
+            dropout = DROPOUT
+    # The first steps draw samples of photos or, if they cannot, half-size photos. The samples of all photos together
+    # need at least as many pixels as there are Gaussians. Cameras that move need half-size photos, whose blur gives a
+    # gradient even to a pose with an error of a pixel
+    sample_pixels = num_photos * (photos[0].width // STRIDE) * (photos[0].height // STRIDE)
+    min_steps = 30  # shorter runs draw too few samples to see all pixels: they lose .07 dB at 20 steps, 1 dB at 7
+    can_sample = steps >= min_steps and not options.move_cameras and max(1, job.count) <= sample_pixels
     full_weights, *large_weights = (_weigh(_weights_of(level), level) for level in (photos[0], *photos[2:]))
     score_weights = half_weights = _weights_of(photos[1])
     first_pixels = None
@@ -161,7 +171,7 @@ def prepare_fit(job: FitJob) -> FitRun:
         first_pixels = tuple((weight != 0) & (weight != HIDDEN_WEIGHT) for weight in holdout_weights)
         score_weights = reduced(holdout_weights, photos[1])
         half_weights = [np.where(weight == HIDDEN_WEIGHT, np.float32(0), weight) for weight in score_weights]
-        if len(photos[0]) == 1:  # no other photo shows the held-out patches, so the fit is scored on all pixels
+        if num_photos == 1:  # no other photo shows the held-out patches, so the fit is scored on all pixels
             score_weights = [np.where(weight == 1, np.float32(0), weight) for weight in score_weights]
     return FitRun(
         job=job,
@@ -169,28 +179,9 @@ def prepare_fit(job: FitJob) -> FitRun:
         step_weights=(full_weights, _weigh(half_weights, photos[1]), *large_weights),
         dropout=dropout,
         half_part=options.half_res_part,
-        samples=_can_sample(job),
+        samples=can_sample,
         first_pixels=first_pixels,
     )
-
-
-def default_dropout(steps: int, num_photos: int) -> float:
-    """Return the share of the Gaussians that each step leaves out, in a run of ``steps`` steps on ``num_photos``."""
-    if num_photos <= FEW_VIEWS and steps >= MANY_STEPS:
-        return DROPOUT
-    return LONG_DROPOUT if steps >= max(LONG_STEPS, LONG_ROUNDS * num_photos) else 0.0
-
-
-def _can_sample(job: FitJob) -> bool:
-    """Return true if the first steps may draw samples of photos, false if they have to draw half-size photos.
-
-    The samples of all photos together need at least as many pixels as there are Gaussians. Cameras that move need
-    half-size photos, whose blur gives a gradient even to a pose with an error of a pixel.
-    """
-    photos, options = job.photos[0], job.options
-    pixels = len(photos) * (photos.width // STRIDE) * (photos.height // STRIDE)
-    min_steps = 30  # shorter runs draw too few samples to see all pixels: they lose .07 dB at 20 steps, 1 dB at 7
-    return options.steps >= min_steps and not options.move_cameras and max(1, job.count) <= pixels
 
 
 def _weights_of(photos: Photos) -> list[np.ndarray]:

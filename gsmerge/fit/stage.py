@@ -12,12 +12,12 @@ from gsmerge.fit.full import fit_full
 from gsmerge.fit.growth import MOST_GROWTH
 from gsmerge.fit.outside import place_outside_views, score_fog
 from gsmerge.fit.photo_sizes import fit_photos
-from gsmerge.fit.report import FitReport, FitResult, Fitted, record_fit, report_steps
+from gsmerge.fit.report import FitResult, Fitted, record_fit, report_steps
 from gsmerge.fit.schedule import FitJob, prepare_fit
 from gsmerge.fit.survey import photo_mses, survey_photos
 from gsmerge.geometry.transforms import clamp_inside
 from gsmerge.raster import make_splats
-from gsmerge.raster.photos import Photos, scene_photos
+from gsmerge.raster.photos import scene_photos
 from gsmerge.runtime.record import record_choices, stage
 from gsmerge.settings.fit import FitOptions
 from gsmerge.types import Decoded, Gaussians, PicturedScene
@@ -78,44 +78,31 @@ def fit_scene(
 
 
 def fit_gaussians(gaussians: Gaussians, job: FitJob) -> FitResult:
-    """Drop Gaussians that no photo shows, fit the rest, and measure the fog of the result; return it with a report."""
-    fitted, report = _choose_fit(gaussians, job)
-    if job.outside is not None:
-        report = replace(report, fog=score_fog(make_splats(fitted), job.outside))
-    return fitted, report
+    """Drop Gaussians that no photo shows, fit the rest, and measure the fog of the result; return it with a report.
 
-
-def _choose_fit(gaussians: Gaussians, job: FitJob) -> FitResult:
-    """Fit the Gaussians that some photo shows, or return them as they were if the fit made most photos worse."""
+    If most photos become worse, the Gaussians that some photo shows are returned as they were. If the Gaussians were
+    already fitted, they can become worse, because steps of the default size scatter them. Whole photos are compared
+    only if held-out patches gained less than ``CLOSE`` dB. A fit is not refused because of held-out patches alone. If
+    few views see a place, held-out patches become worse even in fits that improve new views by up to 10 dB.
+    """
     run = prepare_fit(job)
-    scored_photos = job.scored_photos(0) if job.held_out is None else job.held_out
+    photos = job.scored_photos(0) if job.held_out is None else job.held_out
     survey = survey_photos(gaussians, run)
     is_shown = survey.visible(job.options.min_contribution)
     start, rows = gaussians[is_shown], np.flatnonzero(is_shown)
     fixed = None if job.fixed is None else job.fixed[rows]
-    fitted, report = _better_of(scored_photos, start, *fit_full(start, run, survey[is_shown], fixed))
-    if not report.accepted:
-        return start, replace(report, origins=rows)
+    fitted, report = fit_full(start, run, survey[is_shown], fixed)
     assert report.origins is not None
-    return fitted, replace(report, origins=rows[report.origins])
-
-
-def _better_of(photos: Photos, before: Gaussians, after: Gaussians, report: FitReport) -> FitResult:
-    """Return the Gaussians ``after`` the fit, or the Gaussians ``before`` the fit if most photos became worse.
-
-    If the Gaussians were already fitted, they can become worse, because steps of the default size scatter them. Whole
-    photos are compared only if held-out patches gained less than ``CLOSE`` dB. A fit is not refused because of held-out
-    patches alone. If few views see a place, held-out patches become worse even in fits that improve new views by up to
-    10 dB.
-    """
-    if report.holdout_after - report.holdout_before >= CLOSE:
-        return after, report
-    moved_photos = photos if report.viewmats is None else replace(photos, viewmats=report.viewmats[: len(photos)])
-    error_ratios = photo_mses(after, moved_photos) / photo_mses(before, photos)
-    if np.median(error_ratios) <= 1:  # not the mean, because a placed camera may see only one near Gaussian
-        return after, report
-    stopped = "most photos were shown worse"
-    return before, replace(report, method="none", accepted=False, stopped=stopped, viewmats=None)
+    report = replace(report, origins=rows[report.origins])
+    if not report.holdout_after - report.holdout_before >= CLOSE:  # also if no patches are held out
+        moved_photos = photos if report.viewmats is None else replace(photos, viewmats=report.viewmats[: len(photos)])
+        error_ratios = photo_mses(fitted, moved_photos) / photo_mses(start, photos)
+        if not np.median(error_ratios) <= 1:  # not the mean, because a placed camera may see only one near Gaussian
+            fitted, stopped = start, "most photos were shown worse"
+            report = replace(report, method="none", accepted=False, stopped=stopped, viewmats=None, origins=rows)
+    if job.outside is not None:
+        report = replace(report, fog=score_fog(make_splats(fitted), job.outside))
+    return fitted, report
 
 
 def start_share(options: FitOptions) -> float:

@@ -103,26 +103,24 @@ class StepBuffers:
         """Return the table for photos of this size, with the addresses of photo, weights and drawn opacities."""
         of_step = {"photo": photo, "weight": weight, "drawn": drawn}
         if weight.shape not in self.tables:
-            table = FilledTable(STEP, self.gaussians | self.room | self._pixel_buffers(*weight.shape) | of_step)
+            height, width = weight.shape
+            columns, lines, line = -(-width // TILE), -(-height // TILE), kernels.room_of(width)
+            spans, tiles, corners = 2 * self.threads, columns * lines, (columns + 1) * (lines + 1)
+            shapes: dict[str, tuple[int, ...]] = {
+                "image": (height, width, 3), "gradient": (height, width, 3), "transmittance": (height, width),
+                "errors": (height,), "terms": (self.threads, kernels.DERIVATIVE_ROWS, kernels.TERMS, line),
+                "rows": (self.threads, kernels.EDGE_ROWS, line), "light": (tiles,),
+            }  # fmt: skip
+            counts = {"corners": (spans, corners), "counts": (spans, tiles), "offsets": (tiles + 1,)}
+            arrays = {name: np.empty(shape, np.float32) for name, shape in shapes.items()}
+            arrays |= {name: np.empty(shape, np.int64) for name, shape in counts.items()}
+            table = FilledTable(STEP, self.gaussians | self.room | arrays | of_step)
             calls = [fit_phase.prepare(table.values, phase) for phase in range(len(PHASES))]
             self.tables[weight.shape] = table, calls
         table = self.tables[weight.shape][0]
         for name, array in of_step.items():
             table.point(name, array)
         return table
-
-    def _pixel_buffers(self, height: int, width: int) -> dict[str, np.ndarray]:
-        """Allocate the arrays of a table that depend on the size of the photo, by name."""
-        columns, lines, line = -(-width // TILE), -(-height // TILE), kernels.room_of(width)
-        spans, tiles, corners = 2 * self.threads, columns * lines, (columns + 1) * (lines + 1)
-        shapes: dict[str, tuple[int, ...]] = {
-            "image": (height, width, 3), "gradient": (height, width, 3), "transmittance": (height, width),
-            "errors": (height,), "terms": (self.threads, kernels.DERIVATIVE_ROWS, kernels.TERMS, line),
-            "rows": (self.threads, kernels.EDGE_ROWS, line), "light": (tiles,),
-        }  # fmt: skip
-        counts = {"corners": (spans, corners), "counts": (spans, tiles), "offsets": (tiles + 1,)}
-        pictures = {name: np.empty(shape, np.float32) for name, shape in shapes.items()}
-        return pictures | {name: np.empty(shape, np.int64) for name, shape in counts.items()}
 
     def _run_phases(self, size: tuple[int, int], *phases: str) -> None:
         """Run ``phases`` of a step one after the other, each on all threads, with the table for photos of ``size``."""

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from gsmerge.fit.fit_state import FitState
-from gsmerge.fit.outside import veil_gradients
 from gsmerge.fit.poses import PoseState, start_poses
 from gsmerge.fit.schedule import GROWTH, FitRun, Step, first_decay, step_sizes
 from gsmerge.fit.step_buffers import StepBuffers
@@ -51,18 +50,15 @@ class Optimiser:
             "loss_weights": np.array([rates.ssim_lambda, rates.edge_weight * step.progress], np.float32),
         }
         with use_threads() as threads:
-            buffers = self._buffers_of(state, threads)
-            error, viewmat_gradient = buffers.take_step(
+            # the buffers of the last step fit only its state and its number of threads
+            if self.buffers is None or self.buffers.state is not state or self.buffers.threads != threads:
+                self.buffers = StepBuffers(state, threads, self.poses is not None)
+            error, viewmat_gradient = self.buffers.take_step(
                 step.number, photo, weight, self.drawn_opacities(state, step), numbers
             )
         if self.poses is not None and viewmat_gradient is not None:
             self.poses.step(step.view, viewmat_gradient, rates, step.progress)
         return error / max(3 * float(weight.sum()), 1)
-
-    def clear_veils(self, state: FitState, step: Step, view: int) -> None:
-        """Change a state by one Adam step against fog and veils in a view from outside."""
-        assert self.run.job.outside is not None
-        self.move(state, veil_gradients(state.splats, self.run.job.outside, view), step)
 
     def move(self, state: FitState, g: Gradients, step: Step) -> None:
         """Change the Gaussians of a state that have gradients ``g`` by one Adam step."""
@@ -120,12 +116,6 @@ class Optimiser:
         before = np.array([*moves, np.inf, log_length], np.float32)
         after = np.array([*moves, log_ratio, log_length], np.float32)
         return before, after
-
-    def _buffers_of(self, state: FitState, threads: int) -> StepBuffers:
-        """Return the buffers of the last step, or new ones if the state or the number of threads is another one."""
-        if self.buffers is None or self.buffers.state is not state or self.buffers.threads != threads:
-            self.buffers = StepBuffers(state, threads, self.poses is not None)
-        return self.buffers
 
 
 def make_optimiser(run: FitRun) -> Optimiser:

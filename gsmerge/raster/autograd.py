@@ -12,7 +12,7 @@ from torch.autograd.function import once_differentiable
 
 from gsmerge.kernels.raster.project import add_rows
 from gsmerge.raster.composite import Rendering, draw_views, prepare_views, view_colors
-from gsmerge.raster.gradient import ColorGradients, Gradients, color_gradients, gradients_of, pose_gradient
+from gsmerge.raster.gradient import ColorGradients, color_gradients, gradients_of, pose_gradient
 from gsmerge.raster.tiled_view import Array, TiledView, tile_view
 from gsmerge.types import Cameras, Gaussians
 
@@ -66,7 +66,17 @@ class _Render(torch.autograd.Function):
             colors = view_colors(tiled)
             grads = gradients_of(tiled, colors, image, transmittance, grad_image, -grad_alpha, with_viewmat)
             color_grads = color_gradients(tiled, grads.colors, colors, used=color_grads)
-            _add_view(totals, grads, color_grads)
+            columns = [
+                grads.means + color_grads.means,
+                grads.quats,
+                grads.scales,
+                grads.opacities,
+                color_grads.sh0,
+                color_grads.shN,
+            ]
+            for total, column in zip(totals, columns, strict=True):
+                width = total[:1].size
+                add_rows(grads.ids, column.reshape(len(column), width), total.reshape(len(total), width))
             if with_viewmat:
                 viewmat_grads[view] = pose_gradient(tiled, grads, color_grads)
         gradients = [
@@ -74,21 +84,6 @@ class _Render(torch.autograd.Function):
             for total, tensor, needed in zip([*totals, viewmat_grads], tensors, ctx.needs_input_grad[4:], strict=True)
         ]
         return None, None, None, None, *gradients
-
-
-def _add_view(totals: list[Array], grads: Gradients, color_grads: ColorGradients) -> None:
-    """Add the gradients of one view to ``totals``, an array for each field with the gradients of all Gaussians."""
-    columns = [
-        grads.means + color_grads.means,
-        grads.quats,
-        grads.scales,
-        grads.opacities,
-        color_grads.sh0,
-        color_grads.shN,
-    ]
-    for total, column in zip(totals, columns, strict=True):
-        width = total[:1].size
-        add_rows(grads.ids, column.reshape(len(column), width), total.reshape(len(total), width))
 
 
 def render_tensors(

@@ -50,14 +50,6 @@ class ColorGradients:
     means: Array  # [m,3] float32, through the viewing direction only
 
 
-def _block_ranges(count: int, threads: int) -> list[tuple[int, int]]:
-    """Split ``count`` Gaussians into ranges for the threads that consist of whole blocks of the kernels."""
-    num_blocks = -(-count // BLOCK)
-    num = max(1, min(threads, count // MIN_PER_THREAD))
-    edges = [BLOCK * (num_blocks * i // num) for i in range(num)] + [count]
-    return list(pairwise(edges))
-
-
 def gradients_of(
     tiled: TiledView,
     colors: Array,
@@ -99,7 +91,10 @@ def gradients_of(
 
     with use_threads() as threads:
         parallel_map(blend_tiles, tile_ranges(tiled, threads, MIN_PER_THREAD))
-        parallel_map(project, _block_ranges(m, threads))
+        # the range of each thread consists of whole blocks of the kernels
+        num = max(1, min(threads, m // MIN_PER_THREAD))
+        edges = [BLOCK * (num_blocks * i // num) for i in range(num)] + [m]
+        parallel_map(project, pairwise(edges))
     viewmat = None if poses is None else viewmat_gradient(poses, splats.origin)
     return Gradients(tiled.ids, means, quats, scales, opacities, color_sums, viewmat)
 

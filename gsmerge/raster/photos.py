@@ -276,32 +276,22 @@ def score_photos(
         return scored_tiles(view, photos.width, photos.height, every)
 
     def score_render(view: int, image: np.ndarray, transmittance: np.ndarray) -> RenderScore:
-        """Score the render of one view."""
-        return _score_render(image, masks.get(view, transmittance < COVERED_TRANSMITTANCE), photos, view, every)
+        """Score the render of one view over all scored pixels and over covered pixels. The render is clipped."""
+        covered_pixels = masks.get(view, transmittance < COVERED_TRANSMITTANCE)
+        mask = _scored_pixels(photos, view, every)
+        covered_pixels = covered_pixels if mask is None else covered_pixels & mask
+        share = float(covered_pixels.sum() / (covered_pixels.size if mask is None else max(1, mask.sum())))
+        compared = [mask, covered_pixels] if 0 < share < WHOLE_SHARE else [mask]
+        psnrs = psnr_within(np.clip(image, 0, 1, out=image), photos.images[view], compared)
+        return RenderScore(psnrs[0], psnrs[-1] if share else math.nan, share, covered_pixels)
 
-    return _average_scores(photo_errors(gaussians, photos, score_render, views, tiles=tiles, **settings))
-
-
-def _average_scores(scores: Sequence[RenderScore]) -> PhotoScore:
-    """Average the scores of views. Each PSNR counts as at most ``MAX_PSNR``, because it may be infinite."""
+    scores = photo_errors(gaussians, photos, score_render, views, tiles=tiles, **settings)
+    # each PSNR counts as at most MAX_PSNR, because it may be infinite
     covered_psnrs = [min(score.covered_psnr, MAX_PSNR) for score in scores if score.share > 0]
     share = float(np.mean([score.share for score in scores]))
     mean = float(np.mean([min(score.psnr, MAX_PSNR) for score in scores]))
     covered_mean = float(np.mean(covered_psnrs)) if covered_psnrs else math.nan
     return PhotoScore(mean, covered_mean, share, tuple(score.covered for score in scores))
-
-
-def _score_render(image: np.ndarray, covered: np.ndarray, photos: Photos, view: int, every: int) -> RenderScore:
-    """Score a render ``[h,w,3]`` against a view's photo, over all scored pixels and over ``covered [h,w]`` pixels.
-
-    The render is clipped in place. ``every`` is as in :func:`score_photos`.
-    """
-    mask = _scored_pixels(photos, view, every)
-    covered = covered if mask is None else covered & mask
-    share = float(covered.sum() / (covered.size if mask is None else max(1, mask.sum())))
-    masks = [mask, covered] if 0 < share < WHOLE_SHARE else [mask]
-    psnrs = psnr_within(np.clip(image, 0, 1, out=image), photos.images[view], masks)
-    return RenderScore(psnrs[0], psnrs[-1] if share else math.nan, share, covered)
 
 
 def _scored_pixels(photos: Photos, view: int, every: int) -> np.ndarray | None:

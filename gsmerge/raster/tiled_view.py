@@ -84,17 +84,6 @@ def _choose_origin(means: Array) -> Array:
     return centre if np.abs(centre).max() > far_origin * spread else np.zeros(3)
 
 
-def _shift_means(means: Array, origin: Array) -> Array:
-    """Subtract ``origin [3]`` from ``means [n,3]`` in float64, and round the result to float32."""
-    shifted = np.empty(means.shape, np.float32)
-    if means.dtype == np.float32:
-        projection.shift_means(np.ascontiguousarray(means), np.ascontiguousarray(origin, np.float64), shifted)
-        return shifted
-    for axis in range(3):  # NumPy takes a third of the time if it subtracts one axis at a time
-        np.subtract(means[:, axis], origin[axis], out=shifted[:, axis], dtype=np.float64, casting="unsafe")
-    return shifted
-
-
 def make_splats(gaussians: Gaussians, origin: ArrayLike | None = None) -> Splats:
     """Convert Gaussians to float32 splats for the kernels, without a copy of arrays of the right type and layout.
 
@@ -104,7 +93,16 @@ def make_splats(gaussians: Gaussians, origin: ArrayLike | None = None) -> Splats
     """
     gaussians = gaussians.numpy()
     zero = _choose_origin(gaussians.means) if origin is None else np.asarray(origin, np.float64).reshape(3)
-    columns = vars(gaussians) | {"means": _shift_means(gaussians.means, zero) if zero.any() else gaussians.means}
+    means = gaussians.means
+    if zero.any():  # subtracted in float64, and the result is rounded to float32
+        shifted = np.empty(means.shape, np.float32)
+        if means.dtype == np.float32:
+            projection.shift_means(np.ascontiguousarray(means), np.ascontiguousarray(zero, np.float64), shifted)
+        else:
+            for axis in range(3):  # NumPy takes a third of the time if it subtracts one axis at a time
+                np.subtract(means[:, axis], zero[axis], out=shifted[:, axis], dtype=np.float64, casting="unsafe")
+        means = shifted
+    columns = vars(gaussians) | {"means": means}
     return Splats(**{name: np.ascontiguousarray(column, np.float32) for name, column in columns.items()}, origin=zero)
 
 
@@ -147,21 +145,26 @@ def camera_numbers(
     return camera
 
 
-def _corner_sums(tiles: Array, tile_height: int, tile_width: int) -> Array:
-    """Count, for each corner of a tile, the True ``tiles`` above and to its left.
+def cache_line_rows(count: int, width: int) -> Array:
+    """Allocate ``[count,width]`` float32 from the start of a cache line, so that no short row lies in two lines."""
+    cache_line = 16  # float32 values per cache line
+    buffer = np.empty(count * width + cache_line, np.float32)
+    start = -(buffer.ctypes.data // buffer.itemsize) % cache_line
+    return buffer[start : start + count * width].reshape(count, width)
 
-    The counts at the four corners of a box tell whether it contains a True tile. Returns
-    ``[tile_height+1,tile_width+1]`` int32. Raises ValueError if ``tiles`` have another shape.
+
+def _project(
+    splats: Splats, opacities: Array, keep: Array | None, tiles: Array | None, camera: Array, threads: int
+) -> tuple[Array, Array, Array, Array]:
+    """Project the Gaussians that may touch the image or, with a mask ``tiles``, its True tiles.
+
+    Returns their ascending ids ``[m]``, conics ``[m,8]``, depths ``[m]`` and boxes of tiles ``[m,4]``.
     """
-    if tiles.shape != (tile_height, tile_width):
-        raise ValueError(f"tiles: expected shape {[tile_height, tile_width]}, got {list(tiles.shape)}")
-    return np.pad(tiles.astype(np.int32).cumsum(0).cumsum(1), ((1, 0), (1, 0))).astype(np.int32)
-
-
-def _find_visible(
-    splats: Splats, opacities: Array, keep: Array | None, corner_sums: Array | None, camera: Array, threads: int
-) -> Array:
-    """Return the ascending ids of the Gaussians that may touch the image or, with ``corner_sums``, its chosen tiles."""
+    corner_sums = None
+    if tiles is not None:
+        # Number of True tiles above and to the left of each corner of a tile. The counts at the four corners of a box
+        # tell whether it contains a True tile
+        corner_sums = np.pad(tiles.astype(np.int32).cumsum(0).cumsum(1), ((1, 0), (1, 0))).astype(np.int32)
 
     def cull(span: tuple[int, int]) -> Array:
         """Return the ids of the Gaussians in a range of rows that may touch the image or its chosen tiles."""
@@ -172,19 +175,7 @@ def _find_visible(
         )
         return ids[:count].copy()
 
-    return np.concatenate(parallel_map(cull, pieces(len(splats), threads)))
-
-
-def cache_line_rows(count: int, width: int) -> Array:
-    """Allocate ``[count,width]`` float32 from the start of a cache line, so that no short row lies in two lines."""
-    cache_line = 16  # float32 values per cache line
-    buffer = np.empty(count * width + cache_line, np.float32)
-    start = -(buffer.ctypes.data // buffer.itemsize) % cache_line
-    return buffer[start : start + count * width].reshape(count, width)
-
-
-def _project(splats: Splats, opacities: Array, ids: Array, camera: Array, threads: int) -> tuple[Array, Array, Array]:
-    """Return the conics ``[m,8]``, the depths ``[m]`` and the boxes of tiles ``[m,4]`` of the Gaussians ``ids [m]``."""
+    ids = np.concatenate(parallel_map(cull, pieces(len(splats), threads)))
     m = len(ids)
     conics, depths = cache_line_rows(m, projection.CONIC), np.empty(m, np.float32)
     boxes = np.empty((m, 4), np.int16)
@@ -198,7 +189,7 @@ def _project(splats: Splats, opacities: Array, ids: Array, camera: Array, thread
         )  # fmt: skip
 
     parallel_map(project, pieces(m, threads))
-    return conics, depths, boxes
+    return ids, conics, depths, boxes
 
 
 def hides_most(num_intersections: int, num_visible: int) -> bool:
@@ -267,19 +258,6 @@ def _check_view(viewmat: Array, K: Array, width: int, height: int) -> None:
         raise ValueError(f"expected positive focal lengths, got {K[0, 0]} and {K[1, 1]}")
 
 
-def _convert_for_kernels(splats: Splats, opacities: Array | None, keep: Array | None) -> tuple[Array, Array | None]:
-    """Convert opacities ``[n]`` and the mask ``keep [n]`` to the types of the kernels.
-
-    By default, the splats give the opacities. Raises ValueError if a length is not the number of splats.
-    """
-    opacities = splats.opacities if opacities is None else np.ascontiguousarray(opacities, np.float32)
-    keep = None if keep is None else np.ascontiguousarray(keep, bool).view(np.uint8)
-    num_flags = len(splats) if keep is None else len(keep)
-    if opacities.shape != (len(splats),) or num_flags != len(splats):
-        raise ValueError(f"expected {len(splats)} opacities and keep flags, got {len(opacities)} and {num_flags}")
-    return opacities, keep
-
-
 def tile_view(
     splats: Splats,
     viewmat: ArrayLike,
@@ -316,7 +294,11 @@ def tile_view(
     _check_view(viewmat, K, width, height)
     if not (0 < near < far and eps2d >= 0):
         raise ValueError(f"expected 0 < near < far and eps2d >= 0, got {near}, {far} and {eps2d}")
-    opacities, keep = _convert_for_kernels(splats, opacities, keep)
+    opacities = splats.opacities if opacities is None else np.ascontiguousarray(opacities, np.float32)
+    keep = None if keep is None else np.ascontiguousarray(keep, bool).view(np.uint8)
+    num_flags = len(splats) if keep is None else len(keep)
+    if opacities.shape != (len(splats),) or num_flags != len(splats):
+        raise ValueError(f"expected {len(splats)} opacities and keep flags, got {len(opacities)} and {num_flags}")
     local_viewmat = viewmat.copy()  # from the coordinates of the splats, whose zero is at `splats.origin`
     local_viewmat[:3, 3] += matmul(local_viewmat[:3, :3], splats.origin)
     camera = camera_numbers(local_viewmat, K, width, height, eps2d, antialiased, near, far)
@@ -326,10 +308,10 @@ def tile_view(
     if is_part:
         tiles = np.zeros((tile_height, tile_width), bool)
         tiles[top:bottom, left:right] = True
-    corner_sums = None if tiles is None else _corner_sums(tiles, tile_height, tile_width)
+    if tiles is not None and tiles.shape != (tile_height, tile_width):
+        raise ValueError(f"tiles: expected shape {[tile_height, tile_width]}, got {list(tiles.shape)}")
     with use_threads() as threads:
-        ids = _find_visible(splats, opacities, keep, corner_sums, camera, threads)
-        conics, depths, boxes = _project(splats, opacities, ids, camera, threads)
+        ids, conics, depths, boxes = _project(splats, opacities, keep, tiles, camera, threads)
         if is_part:
             boxes[:, :2] = boxes[:, :2].clip(left, right)
             boxes[:, 2:] = boxes[:, 2:].clip(top, bottom)
