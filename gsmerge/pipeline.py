@@ -9,14 +9,14 @@ from dataclasses import replace
 
 from gsmerge.fit import Fitted, fit_scene
 from gsmerge.geometry.pooling import Members
-from gsmerge.networks.corrector import Corrector
+from gsmerge.networks.corrector import ANALYTIC, Corrector
 from gsmerge.plan import Plan
 from gsmerge.prepare.prepare_scene import Prepared
 from gsmerge.prepare.row_colors import RENDERS
 from gsmerge.runtime.record import record_choices
 from gsmerge.stages.assign import assign
 from gsmerge.stages.decode import decode_merged
-from gsmerge.stages.encode import correct, encode, make_corrector
+from gsmerge.stages.encode import correct, encode
 from gsmerge.stages.fill import fill_between
 from gsmerge.stages.match import match
 from gsmerge.stages.merge import MergedViews, merge
@@ -79,6 +79,10 @@ def merge_views(prepared: Prepared, plan: Plan, count: int | None) -> Decoded:
 def encode_groups(scene: PicturedScene, groups: Groups, plan: Plan) -> tuple[FeatureGaussians, Members, Corrector]:
     """Encode each superpixel of all views as a Feature Gaussian; also return its members, and the networks."""
     members = assign(scene, groups, by_contribution=plan.by_contribution)
-    networks = make_corrector(plan.networks, members, scene.cameras, plan.seed)
+    networks: Corrector = ANALYTIC  # changes nothing
+    if plan.networks is not None:
+        from gsmerge.networks.apply import NetworkContext
+
+        networks = NetworkContext(plan.networks, members, scene.cameras, plan.seed)
     features = encode(scene, members, groups)
     return correct(features, members, scene.cameras, networks, weaken=plan.weakens), members, networks

@@ -56,7 +56,8 @@ def find_owners(scene: Scene, groups: Groups) -> Owners:
 
     def update_best(view: int, tiled: TiledView) -> None:
         """Replace entries of ``best`` by superpixels of this view with larger contributions."""
-        values, labels = view_owners(tiled, groups.labels[view], groups.counts[view])
+        view_labels = np.ascontiguousarray(groups.labels[view], np.int32)
+        values, labels = dominant_labels(*tiled.lists, view_labels, groups.counts[view])
         with lock:
             best_values, best_views = best.values[tiled.ids], best.views[tiled.ids]
             is_better = (values > best_values) | ((values == best_values) & (labels >= 0) & (view < best_views))
@@ -65,12 +66,6 @@ def find_owners(scene: Scene, groups: Groups) -> Owners:
 
     tile_views(scene, update_best)
     return best
-
-
-def view_owners(tiled: TiledView, labels: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return each Gaussian's largest contribution ``[m]`` to a superpixel of one view, and its label ``[m]``."""
-    labels = np.ascontiguousarray(labels, np.int32)
-    return dominant_labels(*tiled.lists, labels, count)
 
 
 def owner_pixels(owners: Owners, groups: Groups) -> np.ndarray:

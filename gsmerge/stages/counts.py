@@ -127,9 +127,14 @@ def count_limits(
     if max_count < min(views, count):
         remedy = f'; for {max_count} % pass "{max_count}%"' if max_count <= 100 else ""
         raise UsageError(f"budget: expected at least {views}, one for each view, got {max_count}{remedy}")
+    per_view = superpixels_per_view(scene, segment) if views else 0
+    total = max(1, int(segment.share * count))  # without views, superpixels are a share of the Gaussians
+    if views:
+        of_views = per_view * count // scene.pixels_per_view if scene.has_own_pixels else per_view * views
+        total = max(views, of_views)
     return CountLimits(
-        per_view=superpixels_per_view(scene, segment) if views else 0,
-        default=default_count(scene, segment, decode),
+        per_view=per_view,
+        default=round(total * decode.mean_k),
         min_count=max(1, views),
         max_count=max_count,
         exact=exact,
@@ -163,16 +168,6 @@ def has_few_rows(scene: SceneSize) -> bool:
 def _few_pixels(scene: SceneSize) -> int:
     """Return the number of pixels of all views, at most ``FEW_PIXELS``."""
     return min(FEW_PIXELS, scene.num_views * scene.pixels_per_view)
-
-
-def default_count(scene: SceneSize, segment: SegmentOptions, decode: DecodeOptions) -> int:
-    """Return the number of Gaussians that ``superpixels`` and K give, or without views a share of the Gaussians."""
-    count, views = scene.num_gaussians, scene.num_views
-    if views == 0:
-        return round(max(1, int(segment.share * count)) * decode.mean_k)
-    per_view = superpixels_per_view(scene, segment)
-    total = per_view * count // scene.pixels_per_view if scene.has_own_pixels else per_view * views
-    return round(max(views, total) * decode.mean_k)
 
 
 def count_for(options: SegmentOptions, height: int, width: int) -> int:

@@ -53,16 +53,30 @@ def decode(
 def decode_merged(merged: MergedViews, scene: PicturedScene, options: DecodeOptions, *, grows: bool) -> Decoded:
     """Decode merged views into the Gaussians that a fit starts from.
 
-    If an exact number was requested, this number is made, unless the fit ``grows`` to it later. If no exact number was
-    requested, each group gets K Gaussians.
+    If an exact number was requested, this number of visible Gaussians is made, unless the fit ``grows`` to it later. In
+    all other cases each group gets K Gaussians. A superpixel has no members if its Gaussians belong to a nearer view,
+    and other groups get the K Gaussians of this superpixel. Heads that make exactly K Gaussians of every group cannot
+    make more for other groups.
     """
+    features, members, networks = merged.features, merged.members, merged.networks
     count, exact = merged.segmentation.count, merged.segmentation.exact
     if exact and not grows:
-        gaussians = _decode_exactly(merged, count, options)
-    else:
-        gaussians = _decode_count(merged, scene, merged_count(merged, options, grows=grows), options)
-        if exact and len(gaussians) > count:  # K per group exceed the number that the fit may grow to
-            gaussians = _decode_count(merged, scene, count, options)
+        with_faint = replace(options, min_opacity=0.0)
+        gaussians = deal_visible(
+            deal_order(features, members, networks.max_children),
+            len(features),
+            count,
+            options.min_opacity,
+            lambda counts: decode(features, members, with_faint, counts, networks=networks),
+        )
+        return Decoded(gaussians, count, exact)
+    num_empty = len(merged.segmentation.groups) - merged.num_groups
+    num_made: int | None = None  # K of each Feature Gaussian
+    if num_empty and options.k != MIXED and not networks.makes_children:
+        num_made = min(count, options.max_k * (len(features) + num_empty))
+    gaussians = _decode_count(merged, scene, num_made, options)
+    if exact and len(gaussians) > count:  # K per group exceed the number that the fit may grow to
+        gaussians = _decode_count(merged, scene, count, options)
     return Decoded(gaussians, count, exact)
 
 
@@ -79,19 +93,6 @@ def _decode_count(merged: MergedViews, scene: PicturedScene, count: int | None, 
     elif options.k == MIXED:
         children = mixed_counts(features, members, scene_saliency(scene.images), options)
     return decode(features, members, options, children, networks=networks)
-
-
-def _decode_exactly(merged: MergedViews, count: int, options: DecodeOptions) -> Gaussians:
-    """Decode exactly ``count`` visible Gaussians, with more of them in groups where they lower distortion most."""
-    features, members, networks = merged.features, merged.members, merged.networks
-    with_faint = replace(options, min_opacity=0.0)
-    return deal_visible(
-        deal_order(features, members, networks.max_children),
-        len(features),
-        count,
-        options.min_opacity,
-        lambda counts: decode(features, members, with_faint, counts, networks=networks),
-    )
 
 
 def deal_visible(
@@ -146,22 +147,6 @@ def counts_by_saliency(saliency: np.ndarray, options: DecodeOptions) -> np.ndarr
     return counts
 
 
-def merged_count(merged: MergedViews, options: DecodeOptions, *, grows: bool) -> int | None:
-    """Return the number of Gaussians to decode merged views into, or None for K of each Feature Gaussian.
-
-    If an exact number was requested and no fit grows to it, this number is returned. In all other cases the number is K
-    for each group, and K for each superpixel without members. A superpixel has no members if its Gaussians belong to a
-    nearer view, and other groups get the K Gaussians of this superpixel. Heads that make exactly K Gaussians of every
-    group cannot make more for other groups.
-    """
-    segmentation, num_empty = merged.segmentation, len(merged.segmentation.groups) - merged.num_groups
-    if segmentation.exact and not grows:
-        return segmentation.count
-    if num_empty == 0 or options.k == MIXED or merged.networks.makes_children:
-        return None
-    return min(segmentation.count, options.max_k * (len(merged.features) + num_empty))
-
-
 def repeat_groups(features: FeatureGaussians, counts: np.ndarray) -> tuple[Gaussians, np.ndarray]:
     """Repeat each Feature Gaussian ``counts [g]`` times, for heads that make all children themselves.
 
@@ -172,48 +157,38 @@ def repeat_groups(features: FeatureGaussians, counts: np.ndarray) -> tuple[Gauss
 
 
 def divide_groups(features: FeatureGaussians, members: Members, counts: np.ndarray) -> tuple[Gaussians, np.ndarray]:
-    """Divide each Feature Gaussian into at most ``counts [g]`` children.
+    """Divide each Feature Gaussian into at most ``counts [g]`` children, by repeated halving of its members.
 
     Returns the children, faint ones included, and the group ``[n]`` of each child, ascending.
     """
-    is_divided = counts > 1
-    gaussians, parents = feature_to_gaussians(features), np.arange(len(features))
-    if is_divided.any():
-        starts, ids, child_parents = halve_groups(features, members, np.flatnonzero(is_divided), counts)
-        moments = pool_members(members, starts, ids)
-        extinctions = moments.extinctions * features.gains[child_parents]
-        children = to_gaussians(moments.covars, extinctions, moments.means, moments.sh)
-        undivided = np.flatnonzero(~is_divided)
-        parents = np.concatenate([undivided, child_parents])
-        order = np.argsort(parents, kind="stable")
-        parents = parents[order]
-        gaussians = Gaussians.concat([gaussians[undivided], children])[order]
-    return gaussians, parents
-
-
-def halve_groups(
-    features: FeatureGaussians, members: Members, groups: np.ndarray, counts: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Divide the members of some ``groups`` into at most ``counts [g]`` children each, by repeated halving.
-
-    Returns the start ``[n+1]`` of each child in a list of members, the list itself, which has rows ``[m]`` of
-    ``members``, and the group ``[n]`` of each child.
-    """
-    starts, ids = features.starts, features.members
+    is_divided, gaussians = counts > 1, feature_to_gaussians(features)
+    if not is_divided.any():
+        return gaussians, np.arange(len(features))
     centres, footprints = features.means.astype(np.float64), features.footprints.astype(np.float64)
 
     def halve_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the sizes, the members and the groups of the children of the groups ``rows``."""
-        row_starts, row_ids = gather_groups(starts, ids, rows)
+        row_starts, row_ids = gather_groups(features.starts, features.members, rows)
         m = members
-        child_starts, child_ids, parents = bisect(
+        child_starts, child_ids, child_rows = bisect(
             row_starts, row_ids, m.means, m.sh0, m.opacities, centres[rows], footprints[rows], counts[rows]
         )
-        return np.diff(child_starts), child_ids, rows[parents]
+        return np.diff(child_starts), child_ids, rows[child_rows]
 
-    parts = parallel_map(halve_rows, [groups[i : i + GROUPS_PER_TASK] for i in range(0, len(groups), GROUPS_PER_TASK)])
-    sizes, child_ids, parents = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return np.concatenate([[0], np.cumsum(sizes)]), child_ids, parents
+    parts = parallel_map(halve_rows, _tasks_of(np.flatnonzero(is_divided)))
+    sizes, ids, child_parents = (np.concatenate(column) for column in zip(*parts, strict=True))
+    moments = pool_members(members, np.concatenate([[0], np.cumsum(sizes)]), ids)
+    extinctions = moments.extinctions * features.gains[child_parents]
+    children = to_gaussians(moments.covars, extinctions, moments.means, moments.sh)
+    undivided = np.flatnonzero(~is_divided)
+    parents = np.concatenate([undivided, child_parents])
+    order = np.argsort(parents, kind="stable")
+    return Gaussians.concat([gaussians[undivided], children])[order], parents[order]
+
+
+def _tasks_of(groups: np.ndarray) -> list[np.ndarray]:
+    """Split a list of groups into tasks for the threads."""
+    return [groups[i : i + GROUPS_PER_TASK] for i in range(0, len(groups), GROUPS_PER_TASK)]
 
 
 def split_counts(features: FeatureGaussians, members: Members, extra: int, max_children: int = 8) -> np.ndarray:
@@ -240,32 +215,21 @@ def deal_order(features: FeatureGaussians, members: Members, max_children: int =
     """
     if max_children == 1 or len(features) == 0:
         return np.zeros(0, np.int64)
-    gains = hull_gains(_child_errors(features, members, max_children))
-    # The order is stable, so that among equal gains of one group the first child comes first
-    order = np.argsort(-gains.reshape(-1), kind="stable")
-    return order[: int(np.isfinite(gains).sum())] // gains.shape[1]
-
-
-def _child_errors(features: FeatureGaussians, members: Members, max_children: int) -> np.ndarray:
-    """Return the distortion ``[g,max_children]`` of each group with 1, 2 and more children.
-
-    The distortion is NaN for more children than the group has members.
-    """
-    starts, ids = features.starts, features.members
     centres, footprints = features.means.astype(np.float64), features.footprints.astype(np.float64)
 
     def measure_rows(rows: np.ndarray) -> np.ndarray:
-        """Return the distortions of the groups ``rows``."""
-        row_starts, row_ids = gather_groups(starts, ids, rows)
+        """Return the distortions of the groups ``rows`` with 1, 2 and more children, NaN for more than members."""
+        row_starts, row_ids = gather_groups(features.starts, features.members, rows)
         m = members
         return split_errors(
             row_starts, row_ids, m.means, m.sh0, m.opacities, centres[rows], footprints[rows], max_children,
             PLANE_WEIGHT,
         )  # fmt: skip
 
-    groups = np.arange(len(features))
-    tasks = [groups[i : i + GROUPS_PER_TASK] for i in range(0, len(groups), GROUPS_PER_TASK)]
-    return np.concatenate(parallel_map(measure_rows, tasks))
+    gains = hull_gains(np.concatenate(parallel_map(measure_rows, _tasks_of(np.arange(len(features))))))
+    # The order is stable, so that among equal gains of one group the first child comes first
+    order = np.argsort(-gains.reshape(-1), kind="stable")
+    return order[: int(np.isfinite(gains).sum())] // gains.shape[1]
 
 
 def hull_gains(errors: np.ndarray) -> np.ndarray:

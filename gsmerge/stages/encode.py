@@ -6,47 +6,44 @@ A group becomes fainter if the depths of other views contradict it.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from gsmerge.arrays import to_float32
-from gsmerge.geometry.pooling import FOOTPRINT_ROWS, Members, Moments, Rule, pool_members
+from gsmerge.geometry.pooling import FOOTPRINT_ROWS, Members, Rule, pool_members
 from gsmerge.kernels.gaussians.pool import group_members
-from gsmerge.networks.corrector import ANALYTIC, Corrector
+from gsmerge.networks.corrector import Corrector
 from gsmerge.networks.cross_view_stats import cross_view_stats
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, FeatureGaussians, Groups, Scene
-
-if TYPE_CHECKING:
-    from gsmerge.networks.weights import RunnableNetworks
 
 # A group is contradicted if more views see through it than have a surface at its position. The optical depth of a
 # contradicted group is multiplied by ALONE if no other view has a surface at its position, and otherwise by DISPUTED
 ALONE, DISPUTED = 0.15, 0.39
 
 
-def make_corrector(networks: RunnableNetworks | None, members: Members, cameras: Cameras, seed: int) -> Corrector:
-    """Return an object that corrects the results of the stages by networks, which read the scene.
-
-    Without networks the object is ``ANALYTIC``, which changes nothing.
-    """
-    if networks is None:
-        return ANALYTIC
-    from gsmerge.networks.apply import NetworkContext
-
-    return NetworkContext(networks, members, cameras, seed)
-
-
 @stage("encode")
 def encode(scene: Scene, members: Members, groups: Groups, rule: Rule = "depth") -> FeatureGaussians:
     """Pool every superpixel that has members into one Feature Gaussian, in order of view and label.
 
+    The Feature Gaussians have gains of 1 and no latents.
     :func:`gsmerge.geometry.pooling.pool_members` explains the ``rule``.
     """
     starts, ids, views = member_rows(scene, members, groups)
-    return from_moments(pool_members(members, starts, ids, rule), starts, ids, views)
+    moments = pool_members(members, starts, ids, rule)
+    count = len(moments.means)
+    names = ("means", "covars", "weights", "masses", "extinctions", "footprints")
+    return FeatureGaussians(
+        **{name: to_float32(getattr(moments, name)) for name in names},
+        gains=np.ones(count, np.float32),
+        sh0=moments.sh[:, :1],
+        shN=moments.sh[:, 1:],
+        views=views,
+        starts=starts,
+        members=ids,
+        latents=np.zeros((count, 0), np.float32),
+    )
 
 
 @stage("encode")
@@ -82,22 +79,6 @@ def member_rows(scene: Scene, members: Members, groups: Groups) -> tuple[np.ndar
     sizes = np.diff(starts)
     has_members, views = sizes > 0, np.repeat(np.arange(len(scene)), groups.counts)
     return np.concatenate([[0], np.cumsum(sizes[has_members])]), ids, views[has_members]
-
-
-def from_moments(moments: Moments, starts: np.ndarray, ids: np.ndarray, views: np.ndarray) -> FeatureGaussians:
-    """Make Feature Gaussians of the ``moments`` of groups, with gains of 1 and without latents."""
-    count = len(moments.means)
-    names = ("means", "covars", "weights", "masses", "extinctions", "footprints")
-    return FeatureGaussians(
-        **{name: to_float32(getattr(moments, name)) for name in names},
-        gains=np.ones(count, np.float32),
-        sh0=moments.sh[:, :1],
-        shN=moments.sh[:, 1:],
-        views=views,
-        starts=starts,
-        members=ids,
-        latents=np.zeros((count, 0), np.float32),
-    )
 
 
 def weaken_contradicted(features: FeatureGaussians, members: Members, cameras: Cameras) -> FeatureGaussians:

@@ -15,6 +15,7 @@ import numpy as np
 
 from gsmerge.fit.outside import Outside
 from gsmerge.geometry.transforms import is_inside, project
+from gsmerge.geometry.views import resize_cameras
 from gsmerge.kernels.pictures import blur
 from gsmerge.prepare.fill_holes import NEW_SIZE_PIXELS, make_round_gaussians, pixel_rays
 from gsmerge.prepare.place_cameras import between_cameras
@@ -56,17 +57,25 @@ def fill_between(
     added, max_count = fitted[:0], min(most, int(FILLED_SHARE * len(fitted)))
     if max_count == 0 or not 1 < len(cameras) <= MOST_FILLED_VIEWS:
         return added
-    cameras = _small_cameras(cameras)
+    width, height = (max(FILL_LEVEL, round(side / FILL_LEVEL)) for side in (cameras.width, cameras.height))
+    cameras = resize_cameras(replace(cameras, Ks=cameras.Ks.astype(np.float64)), width, height)
     # Distance of a camera just beside a view, as a share of the distance to the nearest view. The distance is negative,
     # because the camera is on the side of the view that is away from the nearest view. Chosen on seven training
     # captures
     beside = -0.1
-    between, splats = _widen(between_cameras(cameras, beside)), make_splats(fitted)
+    between, splats = between_cameras(cameras, beside), make_splats(fitted)
     if len(between) == 0:  # all views look in different directions
         return added
+    # the pictures of the cameras between the views have a margin on each side
+    right, down = (round(FILL_MARGIN * side) for side in (width, height))
+    Ks = between.Ks + np.array([[0, 0, right], [0, 0, down], [0, 0, 0]])
+    between = replace(between, Ks=Ks, width=width + 2 * right, height=height + 2 * down)
     drawings = parallel_map(lambda view: _draw(splats, between, view), range(len(between)))
     depths = parallel_map(lambda view: blend_depths(_tile_camera(splats, cameras, view)), range(len(cameras)))
-    seen = _find_seen(cameras, depths), _find_seen(between, [drawing[:2] for drawing in drawings]).without_gaps()
+    seen_between = _find_seen(between, [drawing[:2] for drawing in drawings])
+    # the cameras between the views contradict no Gaussian in a gap, because their gaps shall be filled
+    farthest = np.where(seen_between.clear, np.float32(0), seen_between.farthest)
+    seen = _find_seen(cameras, depths), Seen(between, farthest, np.zeros_like(seen_between.clear))
 
     def continue_surfaces(view: int) -> Gaussians:
         """Make the Gaussians that fill the gaps of one drawing."""
@@ -101,10 +110,6 @@ class Seen:
     farthest: np.ndarray  # [c,h,w] largest mean depth of the pixels that a new Gaussian at this pixel would reach
     clear: np.ndarray  # [c,h,w] bool, true for gaps
 
-    def without_gaps(self) -> Seen:
-        """Return a copy that contradicts no Gaussian in a gap, for cameras whose gaps shall be filled."""
-        return Seen(self.cameras, np.where(self.clear, np.float32(0), self.farthest), np.zeros_like(self.clear))
-
     def show(self, points: np.ndarray) -> np.ndarray:
         """Return a mask ``[n]`` of the ``points [n,3]`` that lie in the field of view of some camera."""
         pixels, z = project(points, self.cameras)
@@ -127,20 +132,6 @@ def lies_between(known: np.ndarray) -> np.ndarray:
         before, after = (np.logical_or.accumulate(ordered, axis=1) for ordered in (mask, mask[:, ::-1]))
         masks.append(before & after[:, ::-1])
     return np.asarray(masks[0] | masks[1].T)
-
-
-def _small_cameras(cameras: Cameras) -> Cameras:
-    """Return the cameras with smaller pictures, whose pixels are ``FILL_LEVEL`` times as wide."""
-    width, height = (max(FILL_LEVEL, round(side / FILL_LEVEL)) for side in (cameras.width, cameras.height))
-    scales = np.array([[width / cameras.width], [height / cameras.height], [1.0]])
-    return replace(cameras, Ks=cameras.Ks.astype(np.float64) * scales, width=width, height=height)
-
-
-def _widen(cameras: Cameras) -> Cameras:
-    """Return the cameras with larger pictures, which have a margin of ``FILL_MARGIN`` on each side."""
-    right, down = (round(FILL_MARGIN * side) for side in (cameras.width, cameras.height))
-    Ks = cameras.Ks + np.array([[0, 0, right], [0, 0, down], [0, 0, 0]])
-    return replace(cameras, Ks=Ks, width=cameras.width + 2 * right, height=cameras.height + 2 * down)
 
 
 def _tile_camera(splats: Splats, cameras: Cameras, view: int) -> TiledView:
@@ -172,12 +163,27 @@ def _continue_surfaces(
 ) -> Gaussians:
     """Fill the gaps in a camera's ``drawing`` with Gaussians that continue the farthest surface beside each gap.
 
-    Depths of ``DEPTH_FACTORS`` times the surface's depth are tried for each Gaussian. A Gaussian gets the first of
-    these depths that no view contradicts, and is left out if views contradict all. ``seen`` has what the photos'
-    cameras see, and what the cameras between them see. If ``beyond`` is true, Gaussians may be outside of the field of
-    view of all photos.
+    A gap is filled at most as far from the surface as the window of ``WINDOW_SHARE`` reaches, and only between
+    surfaces, unless ``beyond`` is true. Depths of ``DEPTH_FACTORS`` times the surface's depth are tried for each
+    Gaussian. A Gaussian gets the first of these depths that no view contradicts, and is left out if views contradict
+    all. ``seen`` has what the photos' cameras see, and what the cameras between them see. If ``beyond`` is true,
+    Gaussians may be outside of the field of view of all photos.
     """
-    gaps, surface_depths, colors = _spread_into_gaps(drawing, round(WINDOW_SHARE * camera.width), beyond=beyond)
+    drawn_depths, transmittance, image = drawing
+    solid, gaps = transmittance < SURFACE_TRANSMITTANCE, transmittance > GAP_TRANSMITTANCE
+    window = np.ones((2 * round(WINDOW_SHARE * camera.width) + 1,) * 2, np.uint8)
+    nearer = NEARER_SHARE * cv2.dilate(np.where(solid, drawn_depths, np.float32(0)), window)
+    far = solid & (drawn_depths >= nearer)
+    gaps &= cv2.dilate(far.astype(np.uint8), window) > 0
+    gaps &= beyond | lies_between(far)
+    image = image / np.maximum(1 - transmittance, 1e-6)[..., None]
+    values = np.dstack([1 / np.maximum(drawn_depths, 1e-6), image, np.ones_like(drawn_depths)])
+    # Standard deviation in pixels of the blur by which colours and inverse depths spread into gaps. Chosen on seven
+    # training captures
+    blur_pixels = 2.0
+    sums = blur(fill_gaps(values, far) * (gaps | far)[..., None], blur_pixels)[gaps]
+    inverse_depths, colors, weights = sums[:, 0], sums[:, 1:4], sums[:, 4]
+    surface_depths, colors = weights / inverse_depths, colors / weights[:, None]
     eye, rays = camera.centres[0], pixel_rays(gaps, camera.Ks[0], camera.viewmats[0])
     depths = np.array(DEPTH_FACTORS)[:, None] * surface_depths.astype(np.float64)
     points = (eye + depths[..., None] * rays).reshape(-1, 3)
@@ -192,27 +198,3 @@ def _continue_surfaces(
     return make_round_gaussians(
         eye, rays[rows], first_possible, NEW_SIZE_PIXELS / camera.Ks[0][0, 0], colors[rows], num_higher
     )
-
-
-def _spread_into_gaps(
-    drawing: tuple[np.ndarray, np.ndarray, np.ndarray], reach: int, *, beyond: bool
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Spread depths and colours of the farthest surfaces at most ``reach`` pixels into the gaps of a drawing.
-
-    A gap is filled only between surfaces, unless ``beyond`` is true. Returns a mask ``[h,w]`` of the n pixels that are
-    filled, their depths ``[n]``, and their colours ``[n,3]``.
-    """
-    depths, transmittance, image = drawing
-    solid, filled = transmittance < SURFACE_TRANSMITTANCE, transmittance > GAP_TRANSMITTANCE
-    window = np.ones((2 * reach + 1,) * 2, np.uint8)
-    far = solid & (depths >= NEARER_SHARE * cv2.dilate(np.where(solid, depths, np.float32(0)), window))
-    filled &= cv2.dilate(far.astype(np.uint8), window) > 0
-    filled &= beyond | lies_between(far)
-    image = image / np.maximum(1 - transmittance, 1e-6)[..., None]
-    values = np.dstack([1 / np.maximum(depths, 1e-6), image, np.ones_like(depths)])
-    # Standard deviation in pixels of the blur by which colours and inverse depths spread into gaps. Chosen on seven
-    # training captures
-    blur_pixels = 2.0
-    sums = blur(fill_gaps(values, far) * (filled | far)[..., None], blur_pixels)[filled]
-    inverse_depths, colors, weights = sums[:, 0], sums[:, 1:4], sums[:, 4]
-    return filled, weights / inverse_depths, colors / weights[:, None]

@@ -22,20 +22,9 @@ def match(features: FeatureGaussians, options: MatchOptions) -> Matches:
     Each cluster grows from a leader. Leaders are chosen by weight, and by position if weights are equal, so the result
     does not depend on the order of the Feature Gaussians. Feature Gaussians that are fully transparent stay alone.
     """
-    count = len(features)
-    clusters = np.full(count, -1, np.int64)
-    num_clusters = 0
-    if options.match != "none" and len(distinct(features.views)) > 1:
-        solid = np.flatnonzero(features.extinctions > 0)
-        if len(solid) > 1:
-            clusters[solid], num_clusters = _find_clusters(features, solid, options)
-    alone = np.flatnonzero(clusters < 0)
-    clusters[alone] = num_clusters + np.arange(len(alone))
-    return Matches(clusters, num_clusters + len(alone))
-
-
-def _find_clusters(features: FeatureGaussians, rows: np.ndarray, options: MatchOptions) -> tuple[np.ndarray, int]:
-    """Return the cluster ``[m]`` of each Feature Gaussian among ``rows [m]``, and the number of clusters."""
+    rows = np.flatnonzero(features.extinctions > 0)
+    if options.match == "none" or len(rows) < 2 or len(distinct(features.views)) < 2:
+        return Matches(np.arange(len(features)), len(features))
     means, views = features.means[rows].astype(np.float64), features.views[rows]
     covars = np.ascontiguousarray(features.covars[rows].astype(np.float64).reshape(-1, 9)[:, UPPER_TRIANGLE])
     colors = SH_C0 * features.sh0[rows, 0].astype(np.float64)
@@ -47,8 +36,13 @@ def _find_clusters(features: FeatureGaussians, rows: np.ndarray, options: MatchO
     scores = np.empty(neighbors.shape)
     limits = options.max_color, options.similarity
     edge_scores(neighbors, means, covars, colors, latents, views, *limits, boxes, scores)  # fills `scores`
+    clusters = np.full(len(features), -1, np.int64)
     if boxes:
-        return connected_components(neighbors, scores, options.iou)
-    order = np.lexsort((*means.T, -features.weights[rows]))
-    max_size = options.cluster_size or len(distinct(views))
-    return leader_clusters(order, neighbors, scores, views, options.overlap, max_size)
+        clusters[rows], num_clusters = connected_components(neighbors, scores, options.iou)
+    else:
+        order = np.lexsort((*means.T, -features.weights[rows]))
+        max_size = options.cluster_size or len(distinct(views))
+        clusters[rows], num_clusters = leader_clusters(order, neighbors, scores, views, options.overlap, max_size)
+    alone = np.flatnonzero(clusters < 0)
+    clusters[alone] = num_clusters + np.arange(len(alone))
+    return Matches(clusters, num_clusters + len(alone))

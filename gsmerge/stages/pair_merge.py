@@ -86,7 +86,10 @@ def _merge_round(cloud: Cloud, count: int) -> Cloud:
 
     If no pair has a finite cost, the Gaussians with the largest masses are kept.
     """
-    order, starts = _divide_into_cells(cloud.means)
+    starts = np.array([0, len(cloud)])
+    while (starts[1:] - starts[:-1]).max() > CELL:  # halve all cells, as the k-d tree halves its nodes
+        starts = np.sort(np.concatenate([starts, (starts[1:] + starts[:-1]) // 2]))
+    order = make_tree(cloud.means)[0]  # rows in the order of the cells
     pairs, costs = np.zeros((len(cloud), 2), np.int32), np.full(len(cloud), np.inf, np.float32)
     colors = np.ascontiguousarray(cloud.sh[:, :3])
 
@@ -102,10 +105,13 @@ def _merge_round(cloud: Cloud, count: int) -> Cloud:
         )  # fmt: skip
 
     parallel_map(plan_merges, range(0, len(starts) - 1, CELLS_PER_TASK))
-    cheapest_pairs = pairs[_cheapest(costs, len(cloud) - count)]
-    if len(cheapest_pairs) == 0:
+    num_pairs = min(len(cloud) - count, int(np.isfinite(costs).sum()))
+    if num_pairs == 0:
         return cloud[np.sort(np.argsort(-cloud.masses, kind="stable")[:count])]
-    return merge_rows(cloud, cheapest_pairs)
+    highest = np.partition(costs, num_pairs - 1)[num_pairs - 1]
+    below, equal = np.flatnonzero(costs < highest), np.flatnonzero(costs == highest)
+    cheapest = np.concatenate([below, equal[: num_pairs - len(below)]])  # of equal costs, the first ones
+    return merge_rows(cloud, pairs[np.sort(cheapest)])
 
 
 def merge_rows(cloud: Cloud, pairs: np.ndarray) -> Cloud:
@@ -117,32 +123,6 @@ def merge_rows(cloud: Cloud, pairs: np.ndarray) -> Cloud:
     remains = np.ones(len(cloud), bool)
     remains[pairs[:, 1]] = False
     return cloud[remains]
-
-
-def _divide_into_cells(means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Divide Gaussians with ``means [n,3]`` into cells of at most ``CELL`` neighbours.
-
-    Returns the rows ``[n]`` in the order of the cells, and the start ``[c+1]`` of each cell in this order.
-    """
-    count = len(means)
-    starts = np.array([0, count])
-    while (starts[1:] - starts[:-1]).max() > CELL:  # halve all cells, as the k-d tree halves its nodes
-        starts = np.sort(np.concatenate([starts, (starts[1:] + starts[:-1]) // 2]))
-    return make_tree(means)[0], starts
-
-
-def _cheapest(costs: np.ndarray, count: int) -> np.ndarray:
-    """Return the indices, ascending, of the ``count`` lowest finite ``costs [n]``.
-
-    Of equal costs, the lowest indices come first.
-    """
-    finite = np.isfinite(costs)
-    count = min(count, int(finite.sum()))
-    if count == 0:
-        return np.zeros(0, np.int64)
-    highest = np.partition(costs, count - 1)[count - 1]
-    below, equal = np.flatnonzero(costs < highest), np.flatnonzero(costs == highest)
-    return np.sort(np.concatenate([below, equal[: count - len(below)]]))
 
 
 def gaussians_of_cloud(cloud: Cloud, source: Gaussians, wider: float = 0.0) -> Gaussians:

@@ -149,12 +149,25 @@ def region_tree(images: np.ndarray, depths: np.ndarray, groups: Groups, valid: n
     4-connected and not empty. Pixels that are not ``valid [v,h,w]`` do not count, and superpixels without valid pixels
     are merged first. Raises ValueError if the arguments do not fit together.
     """
-    _check_pictures(images, depths, groups, valid)
+    shape = list(groups.labels.shape)
+    for name, array, expected in (("images", images, [*shape, 3]), ("depths", depths, shape), ("valid", valid, shape)):
+        if list(array.shape) != expected:
+            raise ValueError(f"{name}: expected shape {expected}, got {list(array.shape)}")
+    for view, count in enumerate(groups.counts):
+        sizes = np.bincount(groups.labels[view].reshape(-1), minlength=count)
+        if len(sizes) > count or int(sizes.min()) < 1:
+            raise ValueError(f"groups: expected {count} superpixels with pixels in view {view}")
     max_extent = max(1.0, MAX_EXTENT * max(images.shape[1:3]))
 
     def merge_view(view: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, float, int]:
         """Return three arrays of :func:`merge_order`, the error before all merges, and the number of usable pixels."""
-        usable = _usable_depths(depths[view], valid[view])
+        # Depths in units of their median, and 0 for pixels that are not valid or have no finite depth
+        is_usable = valid[view] & np.isfinite(depths[view])
+        positive = is_usable & (depths[view] > 0)
+        median = float(np.median(depths[view][positive])) if positive.any() else 1.0
+        depth_range = 1e3  # largest factor by which a depth may be above or below the median
+        clipped = np.clip(depths[view] / median, 1 / depth_range, depth_range)
+        usable = np.ascontiguousarray(np.where(is_usable, clipped, 0), np.float32)
         labels, count = pad_labels(groups.labels[view]), groups.counts[view]
         pixels = np.ascontiguousarray(images[view], np.float32)
         rows = np.empty((2 * count, TREE_COLUMNS))
@@ -175,28 +188,6 @@ def region_tree(images: np.ndarray, depths: np.ndarray, groups: Groups, valid: n
     distortions = np.cumsum(added) / (3 * max(sum(num_pixels), 1))
     min_regions = len(groups) - int(np.count_nonzero(heights < OVERSIZE))
     return RegionTree(groups, parents, order, offsets, distortions, min_regions)
-
-
-def _check_pictures(images: np.ndarray, depths: np.ndarray, groups: Groups, valid: np.ndarray) -> None:
-    """Raise ValueError if shapes do not fit together, or if a superpixel is empty."""
-    shape = list(groups.labels.shape)
-    for name, array, expected in (("images", images, [*shape, 3]), ("depths", depths, shape), ("valid", valid, shape)):
-        if list(array.shape) != expected:
-            raise ValueError(f"{name}: expected shape {expected}, got {list(array.shape)}")
-    for view, count in enumerate(groups.counts):
-        sizes = np.bincount(groups.labels[view].reshape(-1), minlength=count)
-        if len(sizes) > count or int(sizes.min()) < 1:
-            raise ValueError(f"groups: expected {count} superpixels with pixels in view {view}")
-
-
-def _usable_depths(depths: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """Return depths in units of their median, float32, and 0 for pixels that are not valid or have no finite depth."""
-    usable = valid & np.isfinite(depths)
-    positive = usable & (depths > 0)
-    median = float(np.median(depths[positive])) if positive.any() else 1.0
-    depth_range = 1e3  # largest factor by which a depth may be above or below the median
-    clipped = np.clip(depths / median, 1 / depth_range, depth_range)
-    return np.ascontiguousarray(np.where(usable, clipped, 0), np.float32)
 
 
 def cut_tree(tree: RegionTree, budget: int) -> Groups:

@@ -96,12 +96,30 @@ def superpixels(
         raise ValueError(
             f"count: expected at most {height * width} superpixels ({width} x {height} pixels), got {count}"
         )
-    if segmentation == "rdseg":
-        labels = _rdseg(pixels, count, rectangles, early_sweeps, compactness)
-    elif segmentation == "grid":
+    if segmentation == "grid":
         return like(grid_labels(height, width, count), image)
+    if segmentation == "rdseg":
+        spread = np.float32(compactness**0.5)
+        num_rectangles = int(rectangles * count)
+        pixel_start = 0.45  # with more rectangles per pixel than this, the pixels themselves are merged instead
+        if num_rectangles > pixel_start * height * width:
+            num_regions = height * width  # every pixel is its own region
+            labels = pad_labels(np.arange(num_regions, dtype=np.int32).reshape(height, width))
+        else:
+            block_side = 32  # side in pixels of the squares that are cut into rectangles
+            labels, num_regions = split_rectangles(pixels, num_rectangles, block_side, float(compactness))
+            labels = refine(labels, pixels, num_regions, early_sweeps, spread)
+        labels = merge_regions(labels, pixels, num_regions, count, spread)
+        num_sweeps = 2  # most sweeps in which each pixel may change to a neighbouring region
+        labels = refine(labels, pixels, count, num_sweeps, spread)
     else:
-        labels = _bass(pixels, count, segmentation)
+        if segmentation == "bass":
+            seeds = hexagonal_seeds(height, width, count)
+        else:
+            seeds = seeds_from_density(seed_density(corner_response(pixels), count), count)
+        # CIELAB divided by 100. OpenCV computes CIELAB by tables, so the bits are the same on every processor
+        colours = np.ascontiguousarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2Lab) / np.float32(100))
+        labels = infer_labels(pad_labels(voronoi(seeds, height, width)), colours, count)
     return like(np.ascontiguousarray(labels[1:-1, 1:-1]), image)
 
 
@@ -154,34 +172,3 @@ def _as_pixels(array: np.ndarray) -> np.ndarray:
     if not (low >= -range_slack and high <= 1 + range_slack):  # also refuses NaN
         raise ValueError(f"image: expected values in [0, 1], got {low:g} to {high:g}")
     return np.ascontiguousarray(array, np.float32)
-
-
-def _rdseg(pixels: np.ndarray, count: int, rectangles: float, early_sweeps: int, compactness: float) -> np.ndarray:
-    """Cut an image by the method ``rdseg``, and return padded labels, see :func:`pad_labels`."""
-    height, width, _ = pixels.shape
-    spread = np.float32(compactness**0.5)
-    num_rectangles = int(rectangles * count)
-    pixel_start = 0.45  # with more rectangles per pixel than this, the pixels themselves are merged instead
-    if num_rectangles > pixel_start * height * width:
-        num_regions = height * width  # every pixel is its own region
-        labels = pad_labels(np.arange(num_regions, dtype=np.int32).reshape(height, width))
-    else:
-        block_side = 32  # side in pixels of the squares that are cut into rectangles
-        labels, num_regions = split_rectangles(pixels, num_rectangles, block_side, float(compactness))
-        labels = refine(labels, pixels, num_regions, early_sweeps, spread)
-    labels = merge_regions(labels, pixels, num_regions, count, spread)
-    num_sweeps = 2  # most sweeps in which each pixel may change to a neighbouring region
-    return refine(labels, pixels, count, num_sweeps, spread)
-
-
-def _bass(pixels: np.ndarray, count: int, segmentation: str) -> np.ndarray:
-    """Cut an image by BASS, and return padded labels. Seeds are on a hexagonal grid, or drawn by saliency."""
-    height, width, _ = pixels.shape
-    if segmentation == "bass":
-        seeds = hexagonal_seeds(height, width, count)
-    else:
-        seeds = seeds_from_density(seed_density(corner_response(pixels), count), count)
-    # CIELAB divided by 100. OpenCV computes CIELAB by tables, so the bits are the same on every processor
-    colours = np.ascontiguousarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2Lab) / np.float32(100))
-    labels = pad_labels(voronoi(seeds, height, width))
-    return infer_labels(labels, colours, count)

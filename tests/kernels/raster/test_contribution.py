@@ -11,9 +11,9 @@ from numpy.testing import assert_allclose
 from slow_renderer import render_arrays
 from sweeps import sweep
 
-from gsmerge.kernels.raster.contribution import FIRST_PAIRS, add_row, settle_row
+from gsmerge.kernels.raster.contribution import FIRST_PAIRS, add_row, dominant_labels, settle_row
 from gsmerge.raster import make_splats, tile_view
-from gsmerge.stages.assign import find_owners, view_owners
+from gsmerge.stages.assign import find_owners
 from gsmerge.stages.superpixels import superpixels
 from gsmerge.types import Cameras, Gaussians, Groups, Scene
 
@@ -43,7 +43,7 @@ def test_owner_is_the_superpixel_of_the_largest_sum_of_weights(case: tuple[int, 
     n, seed, opacity, size, count = case
     gaussians, labels = random_gaussians(n, seed, opacity=opacity, size=size), some_labels(count)
     tiled = tile_view(make_splats(gaussians), np.eye(4), K, WIDTH, HEIGHT)
-    values, actual = view_owners(tiled, labels, count)
+    values, actual = dominant_labels(*tiled.lists, labels, count)
     sums = superpixel_sums(gaussians, labels)[tiled.ids]
     assert_allclose(values, sums.max(1), rtol=1e-3, atol=1e-4)
     seen = actual >= 0
@@ -60,7 +60,7 @@ def test_owners_are_right_where_pairs_outgrow_their_arrays() -> None:
     gaussians = replace(gaussians, opacities=0.01 + 0.03 * gaussians.opacities)
     labels = np.arange(HEIGHT * WIDTH, dtype=np.int32).reshape(HEIGHT, WIDTH)
     tiled = tile_view(make_splats(gaussians), np.eye(4), K, WIDTH, HEIGHT)
-    values, actual = view_owners(tiled, labels, HEIGHT * WIDTH)
+    values, actual = dominant_labels(*tiled.lists, labels, HEIGHT * WIDTH)
     sums = superpixel_sums(gaussians, labels)[tiled.ids]
     assert (sums[:, : 16 * WIDTH] > 0).sum() > FIRST_PAIRS
     assert_allclose(values, sums.max(1), rtol=1e-3, atol=1e-4)
@@ -76,8 +76,8 @@ def test_equal_sums_go_to_the_smaller_label() -> None:
     even = np.array([[60.0, 0, 32], [0, 60.0, 1], [0, 0, 1]])
     tiled = tile_view(make_splats(middle), np.eye(4), even, 64, 2)
     rows = np.repeat(np.array([[0], [1]], np.int32), 64, 1)
-    assert view_owners(tiled, rows, 2)[1].tolist() == [0]
-    assert view_owners(tiled, 1 - rows, 2)[1].tolist() == [0]
+    assert dominant_labels(*tiled.lists, rows, 2)[1].tolist() == [0]
+    assert dominant_labels(*tiled.lists, 1 - rows, 2)[1].tolist() == [0]
 
 
 @sweep("seed", [0, 1])
