@@ -149,11 +149,26 @@ def reduced(weights: list[np.ndarray], photos: Photos) -> list[np.ndarray]:
 def holdout_psnr(images: Sequence[np.ndarray], photos: Photos, weights: list[np.ndarray], min_gain: float) -> float:
     """Return the PSNR (dB) of renders on the held-out patches, where ``weights [h,w]`` are 0.
 
-    Renders are brought to the exposures of their photos, if some exposure differs by the factor ``min_gain``.
+    Renders are brought to the exposures of their photos, if some exposure differs by the factor ``min_gain``. The
+    factor of exposure of a view and channel is the least-squares solution on the weighted pixels, from ``1 / MAX_GAIN``
+    to ``MAX_GAIN``. The factors of a channel are then divided by their geometric mean.
     """
     views = range(len(photos))
     clipped = parallel_map(lambda view: np.clip(images[view], 0, 1), views)
-    gains = exposure_gains(clipped, photos.images, weights, min_gain)
+
+    def view_gains(view: int) -> np.ndarray:
+        """Return the factors of exposure ``[3]`` of one view."""
+        image, weight = clipped[view], weights[view][..., None]
+        photo_products, image_squares = (
+            (weight * picture * image).sum((0, 1), dtype=np.float64) for picture in (photos.images[view], image)
+        )
+        return np.clip(photo_products / np.maximum(image_squares, 1e-9), 1 / MAX_GAIN, MAX_GAIN)
+
+    all_gains = np.stack(parallel_map(view_gains, views))
+    all_gains /= exp(log(all_gains).mean(0))
+    if np.abs(log(all_gains)).max() < log(min_gain):
+        all_gains[:] = 1
+    gains = all_gains.astype(np.float32)
 
     def sum_errors(view: int) -> tuple[float, float]:
         """Return the sum of the squared errors of a view's held-out pixels, and the number of these pixels."""
@@ -164,29 +179,3 @@ def holdout_psnr(images: Sequence[np.ndarray], photos: Photos, weights: list[np.
 
     error, count = np.sum(parallel_map(sum_errors, views), axis=0)
     return decibels(error / max(3 * count, 1))
-
-
-def exposure_gains(
-    images: Sequence[np.ndarray], photos: np.ndarray, weights: Sequence[np.ndarray], min_gain: float
-) -> np.ndarray:
-    """Return factors ``[v,3]`` float32 that bring the renders of all views to the exposure of their photos.
-
-    Each factor is the least-squares solution on the weighted pixels of one view and channel, clipped to the range from
-    ``1 / MAX_GAIN`` to ``MAX_GAIN``. After the clipping, the factors of a channel are divided by their geometric mean,
-    so a factor may leave the range again. If all factors are between ``1 / min_gain`` and ``min_gain``, all are set to
-    1.
-    """
-
-    def view_gains(view: int) -> np.ndarray:
-        """Return the factors ``[3]`` of one view."""
-        image, weight = images[view], weights[view][..., None]
-        photo_products, image_squares = (
-            (weight * picture * image).sum((0, 1), dtype=np.float64) for picture in (photos[view], image)
-        )
-        return np.clip(photo_products / np.maximum(image_squares, 1e-9), 1 / MAX_GAIN, MAX_GAIN)
-
-    gains = np.stack(parallel_map(view_gains, range(len(photos))))
-    gains /= exp(log(gains).mean(0))
-    if np.abs(log(gains)).max() < log(min_gain):
-        gains[:] = 1
-    return gains.astype(np.float32)

@@ -170,7 +170,9 @@ def declare(name: str, returns: Argument | None = None, /, **arguments: Argument
         return call_again
 
     call.prepare = prepare  # type: ignore[attr-defined]
-    PROTOTYPES[name] = _prototype(name, returns, arguments)
+    parameters = [f"{argument.c}{'' if argument.shape else ' '}{key}" for key, argument in arguments.items()]
+    parameters += [f"int64_t {size}" for size in names]
+    PROTOTYPES[name] = f"{returns.c if returns else 'void'} {name}({', '.join(parameters)})"
     return call
 
 
@@ -212,13 +214,6 @@ def size_names(arguments: dict[str, Argument]) -> list[str]:
     return list(dict.fromkeys(size for size in sizes if isinstance(size, str) and size not in arguments))
 
 
-def _prototype(name: str, returns: Argument | None, arguments: dict[str, Argument]) -> str:
-    """Return the declaration of a function in C, which a test compares with the source."""
-    parameters = [f"{argument.c}{'' if argument.shape else ' '}{key}" for key, argument in arguments.items()]
-    parameters += [f"int64_t {size}" for size in size_names(arguments)]
-    return f"{returns.c if returns else 'void'} {name}({', '.join(parameters)})"
-
-
 def _entry(library: ctypes.CDLL, name: str, returns: Argument | None, arguments: dict[str, Argument]) -> Any:
     """Return a function of a loaded library for ctypes, and set the types of its arguments and of its result."""
     function = getattr(library, name)
@@ -255,14 +250,9 @@ def _convert_argument(name: str, key: str, argument: Argument, value: Any, sizes
     writeable = flags.writeable
     if not flags.c_contiguous or not flags.aligned or (argument.out and not writeable):
         raise ValueError(f"{name}: {key}: expected an aligned{' writable' * argument.out} array in C order")
-    return _address(value, writeable)
-
-
-def _address(array: np.ndarray[Any, Any], writeable: bool) -> int:
-    """Return the address of an array's values."""
-    if writeable and array.size:  # a buffer takes a fifth of the time
-        return ctypes.addressof(ctypes.c_char.from_buffer(array))  # type: ignore[arg-type]
-    return int(array.__array_interface__["data"][0])
+    if writeable and value.size:  # a buffer takes a fifth of the time
+        return ctypes.addressof(ctypes.c_char.from_buffer(value))  # type: ignore[arg-type]
+    return int(value.__array_interface__["data"][0])
 
 
 def _check_values(name: str, key: str, argument: Argument, value: Any, sizes: dict[str, int]) -> None:

@@ -274,8 +274,15 @@ def run_heads(
 ) -> Array:
     """Return bounded corrections ``[n,13]`` of children by the heads, or zeros if no head corrects their number."""
     options = context.options
-    count, halves = len(group_features.features), options.max_children > SLOTS[-1]
-    starts, sizes, owners = _split_siblings(parents, count, halves=halves)
+    count = len(group_features.features)
+    all_sizes = np.bincount(parents, minlength=count)
+    all_starts = np.cumsum(all_sizes) - all_sizes
+    # A head corrects a run of children together. More than four children of a parent are split into two runs
+    is_split = (all_sizes > SLOTS[-1]) & (options.max_children > SLOTS[-1])
+    first_sizes = np.where(is_split, (all_sizes + 1) // 2, all_sizes)
+    starts = np.concatenate([all_starts, (all_starts + first_sizes)[is_split]])
+    sizes = np.concatenate([first_sizes, (all_sizes - first_sizes)[is_split]])
+    owners = np.concatenate([np.arange(count), np.flatnonzero(is_split)])  # parent of each run
     # The outputs begin with a row of zeros, for children without a head
     outputs, output_rows, num_outputs = [np.zeros((1, RESIDUAL), np.float32)], np.zeros(len(children), np.int64), 1
     for slots, min_size in zip(SLOTS, (1, 2, 3), strict=True):  # the heads and their least numbers of children
@@ -291,21 +298,6 @@ def run_heads(
     return scale_outputs(
         concat_rows(outputs)[output_rows], ABSOLUTE_BOUNDS if options.makes_children else options.bounds
     )
-
-
-def _split_siblings(parents: np.ndarray, count: int, *, halves: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the first row, the number and the parent of each run of children that a head corrects together.
-
-    ``parents`` has the parent of each child, from 0 to ``count - 1``. If ``halves`` is true, more than four children of
-    a parent are split into two runs.
-    """
-    sizes = np.bincount(parents, minlength=count)
-    starts = np.cumsum(sizes) - sizes
-    is_split = (sizes > SLOTS[-1]) & halves
-    first_sizes = np.where(is_split, (sizes + 1) // 2, sizes)
-    run_starts = np.concatenate([starts, (starts + first_sizes)[is_split]])
-    run_sizes = np.concatenate([first_sizes, (sizes - first_sizes)[is_split]])
-    return run_starts, run_sizes, np.concatenate([np.arange(count), np.flatnonzero(is_split)])
 
 
 def _run_head(

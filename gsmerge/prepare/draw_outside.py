@@ -21,7 +21,7 @@ from gsmerge.raster import render
 from gsmerge.raster.images import thin_out
 from gsmerge.raster.photos import NEAR_PLANE, blank_photos, photo_errors
 from gsmerge.runtime.record import note, record_choices
-from gsmerge.types import Cameras, Gaussians, LargePhotos, PicturedScene, Pixels, make_scene
+from gsmerge.types import Cameras, Gaussians, PicturedScene, Pixels, make_scene
 
 # Cameras are placed if views miss at least this share of the Gaussians. A placed camera is used if at least this share
 # of its pixels shows mainly Gaussians that the views miss. In fifteen captures in voxels, at most .001 of the Gaussians
@@ -92,7 +92,19 @@ def _with_drawings(scene: PicturedScene, cameras: Cameras, counting: np.ndarray)
     masks = np.full(scene.images.shape[:3], True) if scene.masks is None else scene.masks
     importance, empty, large = scene.importance, scene.empty, scene.large_photos
     if large is not None:
-        large = _with_large_drawings(large, scene.gaussians, cameras)
+        photos, first = large, max(large.ids) + 1
+        Ks = cameras.Ks * np.array([[large.width / cameras.width], [large.height / cameras.height], [1.0]])
+        at_size = replace(cameras, Ks=Ks, width=large.width, height=large.height)
+
+        def read(number: int) -> np.ndarray:
+            """Return a large photo, or draw a picture if the number is that of a placed camera."""
+            if number < first:
+                return photos.read(number)
+            image = render(scene.gaussians, at_size[[number - first]]).images[0]
+            return np.asarray(np.rint(255 * image.clip(0, 1)), np.uint8)
+
+        ids = *large.ids, *range(first, first + len(cameras))
+        large = replace(large, Ks=np.concatenate([large.Ks, Ks]), ids=ids, read=read)
     # Gaussians with a pixel in the scene keep it
     pixels, placed = scene.get_pixels(), find_pixels(make_scene(scene.gaussians, cameras))
     placed_homes = np.where(placed.homes < 0, -1, placed.homes + len(scene) * scene.pixels_per_view)
@@ -106,20 +118,3 @@ def _with_drawings(scene: PicturedScene, cameras: Cameras, counting: np.ndarray)
         importance=None if importance is None else np.concatenate([importance, np.ones(counting.shape, np.float32)]),
         empty=None if empty is None else np.concatenate([empty, np.zeros(counting.shape, empty.dtype)]),
     )  # fmt: skip
-
-
-def _with_large_drawings(large: LargePhotos, gaussians: Gaussians, cameras: Cameras) -> LargePhotos:
-    """Add drawings of the Gaussians from ``cameras`` to large photos; a drawing is made when it is read."""
-    Ks = cameras.Ks * np.array([[large.width / cameras.width], [large.height / cameras.height], [1.0]])
-    at_size = replace(cameras, Ks=Ks, width=large.width, height=large.height)
-    first = max(large.ids) + 1
-
-    def read(number: int) -> np.ndarray:
-        """Return a large photo, or draw a picture if the number is that of a placed camera."""
-        if number < first:
-            return large.read(number)
-        image = render(gaussians, at_size[[number - first]]).images[0]
-        return np.asarray(np.rint(255 * image.clip(0, 1)), np.uint8)
-
-    ids = *large.ids, *range(first, first + len(cameras))
-    return replace(large, Ks=np.concatenate([large.Ks, Ks]), ids=ids, read=read)

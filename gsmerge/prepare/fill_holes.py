@@ -8,7 +8,6 @@ other views agree best is chosen.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import cv2
@@ -86,10 +85,20 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = Fa
             edges[view] = _Edges(beside, float(np.quantile(depths[covered], FARTHEST_QUANTILE)))
 
     tile_views(scene, find_holes, views)
-    filled = scene
     if edges and np.count_nonzero(bare[views]) < MOST_EMPTY * np.count_nonzero(~empty[views]):
-        filled = _fill_views(scene, holes, edges)
-    return _leave_empty(filled, empty)
+        ids = sorted(edges)
+        added = Gaussians.concat(parallel_map(lambda view: _fill_view(scene, view, holes[view], edges[view]), ids))
+        holes[[view for view in range(len(scene)) if view not in edges]] = False
+        pixels = np.flatnonzero(holes)
+        if scene.region is not None:
+            inside = lies_inside(scene.region, added.means)
+            added, pixels = added[inside], pixels[inside]
+        if len(pixels):
+            note(
+                f"{len(added):,} pixels that no Gaussian covers enough get Gaussians with the colours of their pictures"
+            )
+        scene = fill_pixels(scene, added, pixels)
+    return _leave_empty(scene, empty)
 
 
 def _find_empty(opacity: np.ndarray, shown: np.ndarray, gap: int, *, is_cropped: bool) -> np.ndarray:
@@ -117,23 +126,6 @@ class _Edges:
 
     beside: np.ndarray  # [n] depth of the surface beside each hole
     farthest: float  # Depth of the view's farthest surface
-
-
-def _fill_views(scene: PicturedScene, holes: np.ndarray, edges: Mapping[int, _Edges]) -> PicturedScene:
-    """Return a scene with Gaussians added in the ``holes [v,h,w]`` of the views that have ``edges``, with a note.
-
-    The holes of all other views are removed from ``holes``.
-    """
-    views = sorted(edges)
-    added = Gaussians.concat(parallel_map(lambda view: _fill_view(scene, view, holes[view], edges[view]), views))
-    holes[[view for view in range(len(scene)) if view not in edges]] = False
-    pixels = np.flatnonzero(holes)
-    if scene.region is not None:
-        inside = lies_inside(scene.region, added.means)
-        added, pixels = added[inside], pixels[inside]
-    if len(pixels):
-        note(f"{len(added):,} pixels that no Gaussian covers enough get Gaussians with the colours of their pictures")
-    return fill_pixels(scene, added, pixels)
 
 
 def large_parts(empty: np.ndarray) -> np.ndarray:

@@ -101,6 +101,7 @@ def move_poses(scene: PicturedScene, views: Sequence[int], *, always: bool = Fal
     largest, shortest = (f(scene.cameras.width, scene.cameras.height) for f in (max, min))
     pairs = _choose_pairs(scene, views)
     sides = [side for side in SIDES if side < largest] or [largest]
+    limit_px = 1.5  # a pose counts as wrong if it moves by more than this, in pixels of the views
     min_side = 24  # pixels of the shorter side at the first size; smaller photos say too little
     if len(pairs) == 0 or shortest * sides[0] < min_side * largest:
         return None
@@ -109,8 +110,22 @@ def move_poses(scene: PicturedScene, views: Sequence[int], *, always: bool = Fal
         check = side == sides[0] != sides[-1] and not always  # the first size decides whether poses may be wrong
         level = _make_level(scene, pairs, largest / side, FIRST_PIXELS if check else POSE_PIXELS)
         viewmats, final = _improve_poses(level, viewmats, check=check)
-        before = _gather_evidence(level, start)
-        if not np.isfinite(viewmats).all() or not (always or _any_wrong(level, before, final, end=side == sides[-1])):
+        if not np.isfinite(viewmats).all():
+            return None
+        if always:
+            continue
+        # A pose is wrong if its view moved far, and now agrees better with other views. At the largest size, such a
+        # view has to agree much better, or all views together have to agree better
+        is_far = _view_flows(level, final) > limit_px
+        costs_before, costs = (
+            np.bincount(level.pairs.ravel(), evidence.costs.repeat(2), len(is_far))
+            for evidence in (_gather_evidence(level, start), final)
+        )
+        gains = 1 - costs / np.maximum(costs_before, 1e-9)
+        mean_gain = 1 - costs.sum() / max(costs_before.sum(), 1e-9)
+        is_last = side == sides[-1]
+        is_wrong = (is_far & (gains > (VIEW_GAIN if is_last else LEAST_GAIN))).any()
+        if not is_wrong and not (is_last and is_far.any() and mean_gain > MEAN_GAIN):
             return None
     detail = _make_level(scene, pairs, largest / sides[-1], POSE_PIXELS, detail=True)
     worse = _gather_evidence(detail, viewmats).costs - _gather_evidence(detail, start).costs
@@ -256,21 +271,3 @@ def _view_flows(level: _PhotoLevel, evidence: _Evidence) -> np.ndarray:
     """Return the shift ``[v]``, pixels, of each view's points since the input: the median of the view's pairs."""
     flows = [evidence.flows[(level.pairs == view).any(1)] for view in range(len(level.first_viewmats))]
     return np.array([median(view_flows) if len(view_flows) else 0.0 for view_flows in flows])
-
-
-def _any_wrong(level: _PhotoLevel, before: _Evidence, after: _Evidence, *, end: bool) -> bool:
-    """Return whether some view moved far, and now agrees better with other views.
-
-    At the largest size (``end``), a view that moved far has to agree much better, or all views together have to agree
-    better.
-    """
-    limit_px = 1.5  # a pose counts as wrong if it moves by more than this, in pixels of the views
-    is_far = _view_flows(level, after) > limit_px
-    costs_before, costs = (
-        np.bincount(level.pairs.ravel(), evidence.costs.repeat(2), len(is_far)) for evidence in (before, after)
-    )
-    gains = 1 - costs / np.maximum(costs_before, 1e-9)
-    mean_gain = 1 - costs.sum() / max(costs_before.sum(), 1e-9)
-    if end:
-        return bool((is_far & (gains > VIEW_GAIN)).any() or (is_far.any() and mean_gain > MEAN_GAIN))
-    return bool((is_far & (gains > LEAST_GAIN)).any())

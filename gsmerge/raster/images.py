@@ -24,13 +24,6 @@ ONE_AT_A_TIME = 4_000_000
 BAND_PIXELS = 1 << 22  # largest number of pixels drawn at once; larger images are drawn in bands to save memory
 
 
-def _needs_gradient(gaussians: Gaussians, cameras: Cameras) -> bool:
-    """Return whether some tensor of the Gaussians or of the cameras' poses requires a gradient."""
-    import torch
-
-    return torch.is_grad_enabled() and any(t.requires_grad for t in (*vars(gaussians).values(), cameras.viewmats))
-
-
 @check_arguments
 def render(
     gaussians: Gaussians,
@@ -74,9 +67,14 @@ def render(
     options: dict[str, Any] = {"antialiased": antialiased, "near": near, "far": far}
     values = (*vars(gaussians).values(), cameras.viewmats, cameras.Ks)
     tensors = [value for value in values if not isinstance(value, np.ndarray)]
-    if tensors:  # torch is imported only if there are tensors
+    needs_gradient = False
+    if tensors:
+        import torch  # only if there are tensors
+
         gaussians, cameras = gaussians.to("cpu"), cameras.to("cpu")
-    if tensors and _needs_gradient(gaussians, cameras):
+        moving = (*vars(gaussians).values(), cameras.viewmats)
+        needs_gradient = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in moving)
+    if needs_gradient:
         from gsmerge.raster.autograd import render_tensors  # here because only training needs it
 
         drawn = render_tensors(gaussians, cameras, background_rgb, with_depths=with_depths, **options)
