@@ -161,27 +161,25 @@ class NetworkWeights:
 
     @cached_property
     def _layers(self) -> dict[str, Layer]:
-        """All linear layers by name, packed as the library takes them."""
-        names = [name.removesuffix(".weight") for name, array in self.arrays.items() if array.ndim == 2]
-        return {name: self._layer(name) for name in names}
-
-    def _layer(self, name: str) -> Layer:
-        """Return a packed linear layer.
+        """All linear layers by name, packed as the library takes them.
 
         Layers before and after attention are padded with zeros, so that the values of each head fill whole vectors.
         """
-        weight, bias = self.arrays[f"{name}.weight"], self.arrays[f"{name}.bias"]
         width, heads = self.options.width, self.options.heads
         size = width // heads
         padded_columns = np.arange(width) // size * padded(size) + np.arange(width) % size
-        if name.endswith("attention.pair"):  # outputs are keys, which are not padded, and values
-            padded_columns = np.concatenate([np.arange(width), width + padded_columns])
-            columns = width + heads * padded(size)
-            padded_weight, padded_bias = np.zeros((columns, width), np.float32), np.zeros(columns, np.float32)
-            padded_weight[padded_columns], padded_bias[padded_columns] = weight, bias
-            weight, bias = padded_weight, padded_bias
-        elif name.endswith("attention.out"):  # inputs are means of the values
-            padded_weight = np.zeros((width, heads * padded(size)), np.float32)
-            padded_weight[:, padded_columns] = weight
-            weight = padded_weight
-        return *pack_weights(weight, bias), len(bias)
+        layers = dict[str, Layer]()
+        for name in [name.removesuffix(".weight") for name, array in self.arrays.items() if array.ndim == 2]:
+            weight, bias = self.arrays[f"{name}.weight"], self.arrays[f"{name}.bias"]
+            if name.endswith("attention.pair"):  # outputs are keys, which are not padded, and values
+                rows = np.concatenate([np.arange(width), width + padded_columns])
+                num_rows = width + heads * padded(size)
+                padded_weight, padded_bias = np.zeros((num_rows, width), np.float32), np.zeros(num_rows, np.float32)
+                padded_weight[rows], padded_bias[rows] = weight, bias
+                weight, bias = padded_weight, padded_bias
+            elif name.endswith("attention.out"):  # inputs are means of the values
+                padded_weight = np.zeros((width, heads * padded(size)), np.float32)
+                padded_weight[:, padded_columns] = weight
+                weight = padded_weight
+            layers[name] = *pack_weights(weight, bias), len(bias)
+        return layers

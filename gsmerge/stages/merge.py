@@ -8,6 +8,7 @@ import numpy as np
 
 from gsmerge.arrays import Array, as_tensor, to_float32
 from gsmerge.geometry.pooling import Members
+from gsmerge.kernels.gaussians.pool import gather_groups
 from gsmerge.networks.corrector import ANALYTIC, Corrector
 from gsmerge.runtime.record import stage
 from gsmerge.types import FeatureGaussians, Matches, Segmentation
@@ -56,21 +57,9 @@ def cluster_runs(matches: Matches) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def take_features(features: FeatureGaussians, index: np.ndarray) -> FeatureGaussians:
     """Return the Feature Gaussians in the rows ``index``, with their members."""
-    starts, members = _gather_members(features, index)
+    starts, members = gather_groups(features.starts, features.members, index)
     names = [n for n in features.__dataclass_fields__ if n not in ("starts", "members")]
     return FeatureGaussians(starts=starts, members=members, **{n: getattr(features, n)[index] for n in names})
-
-
-def _gather_members(features: FeatureGaussians, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """List the members of the Feature Gaussians in the rows ``index [m]``.
-
-    Returns the start ``[m+1]`` of each Feature Gaussian's members in one list of members, and this list.
-    """
-    old_starts, sizes = features.starts[index], np.diff(features.starts)[index]
-    starts = np.concatenate([np.zeros(1, np.int64), sizes.cumsum()])
-    positions = (old_starts - starts[:-1]).astype(np.int32).repeat(sizes)  # in the members of all Feature Gaussians
-    positions += np.arange(starts[-1], dtype=np.int32)
-    return starts, features.members[positions]
 
 
 def pool_runs(features: FeatureGaussians, order: np.ndarray, cuts: np.ndarray) -> FeatureGaussians:
@@ -97,7 +86,7 @@ def pool_runs(features: FeatureGaussians, order: np.ndarray, cuts: np.ndarray) -
     delta = rows(features.means) - means[run]
     covars = total(share[:, None, None] * (rows(features.covars) + delta[:, :, None] * delta[:, None]))
     optical_depths = total(extinctions)
-    starts, members = _gather_members(features, order)
+    starts, members = gather_groups(features.starts, features.members, order)
 
     return FeatureGaussians(
         means=to_float32(means),

@@ -42,7 +42,9 @@ def gather_groups(starts, ids, rows):
     """Return the starts ``[r+1]`` and the ids of the members of the groups ``rows [r]``, group after group."""
     sizes = starts[rows + 1] - starts[rows]
     row_starts = np.concatenate([[0], np.cumsum(sizes)])
-    return row_starts, ids[np.repeat(starts[rows] - row_starts[:-1], sizes) + np.arange(row_starts[-1])]
+    positions = (starts[rows] - row_starts[:-1]).astype(np.int32).repeat(sizes)  # in `ids`
+    positions += np.arange(row_starts[-1], dtype=np.int32)
+    return row_starts, ids[positions]
 
 
 def bisect(starts, ids, means, sh0, opacities, centres, footprints, num_children):
