@@ -25,11 +25,11 @@ from gsmerge.io.formats.read_gaussians import GaussianFile
 from gsmerge.io.image_names import natural_key
 from gsmerge.io.photo_files import NO_IMAGES, PhotoArrays, PhotoTransform, as_floats, photo_size
 from gsmerge.reading.alignment.conventions import move_cameras, other_conventions
-from gsmerge.reading.alignment.dropped_rows import follow_rows
-from gsmerge.reading.alignment.frames import exporter_frames, fit_frame, scale_by, solve_poses
+from gsmerge.reading.alignment.dropped_rows import estimate_cameras, follow_rows
+from gsmerge.reading.alignment.explain import refuse_other_cameras
+from gsmerge.reading.alignment.frames import exporter_frames, fit_frame, scale_by, solve_pose
 from gsmerge.reading.alignment.grids import Grid, list_grids, with_poses, with_sizes
 from gsmerge.reading.alignment.layouts import ESTIMATED, Layout
-from gsmerge.reading.alignment.own_cameras import estimate_cameras
 from gsmerge.reading.alignment.score import (
     AS_NEAR,
     AS_NEAR_PX,
@@ -40,6 +40,8 @@ from gsmerge.reading.alignment.score import (
     max_correctable_px,
     pixel_errors,
 )
+from gsmerge.reading.alignment.unaligned import choose_cameras
+from gsmerge.reading.alignment.upright import solve_upright, upright_rotation
 from gsmerge.runtime.memory import free_pages
 from gsmerge.types import Cameras
 
@@ -218,9 +220,9 @@ def _place_layout(source: RowSource, grid: Grid, layout: Layout) -> Recovery | N
     usual = exporter_frames(grid.cameras, source.scale)[0]
     if recovery := accept(grid, usual, _PLAIN_PX):
         return recovery
-    solved = solve_poses(pairs, grid.cameras.Ks)
-    if len(solved) == len(grid.cameras):
-        poses = np.stack([solved[view] for view in range(len(solved))])
+    solved = [solve_pose(pairs, view, K) for view, K in enumerate(grid.cameras.Ks)]
+    poses = np.array([pose for pose in solved if pose is not None])
+    if len(poses) == len(grid.cameras):
         solved_px = check_pairs(pairs, replace(grid.cameras, viewmats=poses)).worst_px
         rounding_px = 0.1  # a file's cameras may err more than solved poses by this, since files round numbers
         limit = max(AS_NEAR * solved_px, solved_px + rounding_px)
@@ -229,28 +231,17 @@ def _place_layout(source: RowSource, grid: Grid, layout: Layout) -> Recovery | N
             frame = fit_frame(other.cameras, poses, source.scale)
             if recovery := accept(other, IDENTITY, limit) or accept(other, frame, limit):
                 return recovery
-    return accept(_move_to_rows(source, grid, layout), IDENTITY, np.inf)
-
-
-def _move_to_rows(source: RowSource, grid: Grid, layout: Layout) -> Grid:
-    """Return a grid whose inexact cameras are moved to show rows in their pixels.
-
-    If the cameras are too far from their pixels, the grid is returned unchanged. If photos confirm the poses as read,
-    the new grid has the poses as read as ``confirmed_viewmats``.
-    """
-    inputs = source.inputs(grid, photos=False)
+    # inexact cameras, if they are not too far from their pixels, are moved to show rows in their pixels
     moved_gaussians = 2000  # Gaussians of a view that its moved pose is solved from
-    pairs = inputs.pairs(layout, moved_gaussians)
-    if not check_pairs(pairs, grid.cameras).worst_px <= max_correctable_px(*grid.size):
-        return grid
-    path, names = str(source.camera_file.path), source.camera_file.names
-    moved = move_cameras(pairs, grid.cameras, names, path, source.inputs(grid).images)
-    if moved is None:
-        return grid
-    confirmed, moves = (grid.cameras.viewmats, ()) if moved.confirmed else (None, moved.moves)
-    return replace(
-        grid, cameras=moved.cameras, remarks=(*grid.remarks, moved.note), moves=moves, confirmed_viewmats=confirmed
-    )
+    more_pairs = inputs.pairs(layout, moved_gaussians)
+    if check_pairs(more_pairs, grid.cameras).worst_px <= max_correctable_px(*grid.size):
+        path, names = str(source.camera_file.path), source.camera_file.names
+        moved = move_cameras(more_pairs, grid.cameras, names, path, source.inputs(grid).images)
+        if moved is not None:  # photos may confirm the poses as read
+            confirmed, moves = (grid.cameras.viewmats, ()) if moved.confirmed else (None, moved.moves)
+            remarks = (*grid.remarks, moved.note)
+            grid = replace(grid, cameras=moved.cameras, remarks=remarks, moves=moves, confirmed_viewmats=confirmed)
+    return accept(grid, IDENTITY, np.inf)
 
 
 def _follow_order(source: RowSource, grid: Grid, frames: Sequence[Similarity]) -> Recovery | None:
@@ -291,15 +282,17 @@ def _align_without_pixels(source: RowSource, grid: Grid, frames: Callable[[], Se
 
     Raises SceneError if no cameras see the rows, or if the rows turn out to be pixels of other cameras.
     """
-    from gsmerge.reading.alignment.explain import no_pixels_error, refuse_other_cameras
-    from gsmerge.reading.alignment.unaligned import choose_cameras
-    from gsmerge.reading.alignment.upright import solve_upright, upright_rotation
-
     inputs = source.inputs(grid)
     refuse_other_cameras(inputs, source.camera_file)
     if source.scale is not None:
         grid = replace(grid, cameras=scale_by(source.scale).move_cameras(grid.cameras))
-    no_pixels, notes_on_choice = no_pixels_error(source.ply.info, grid.cameras), list[str]()
+    # the error of rows that are not the pixels of the cameras states both numbers
+    views, (width, height), count = len(grid.cameras), grid.size, source.ply.info.count
+    expected = f"{views} x {height} x {width} = {views * height * width} (views x height x width)"
+    actual = f"{count} in no known order" if count == views * height * width else str(count)
+    problem = f"expected one Gaussian per pixel, {expected}, found {actual}"
+    remedy = "give the cameras of their views, in the frame of the Gaussians"
+    no_pixels, notes_on_choice = SceneError(source.ply.info.path, problem, remedy), list[str]()
     rotation = upright_rotation(inputs)
     if rotation is None:
         grid, notes_on_choice = choose_cameras(replace(inputs, cameras=grid.cameras), grid, frames(), no_pixels)

@@ -81,7 +81,13 @@ def calibrate(pairs: Correspondences, width: int, height: int) -> Calibration | 
     unit = float(np.median(np.abs(pairs.points - middle))) or 1.0
     points, pixels = [(view.points - middle) / unit for view in views], [view.pixels for view in views]
     limit_px, projective_px = pixel_limit(width, height), max(map(projective_error, points, pixels), default=math.inf)
-    model = _choose_model(points, pixels, (width, height), projective_px) if projective_px <= limit_px else None
+    # the simplest intrinsics that explain the pixels
+    models: list[_Model] = []
+    if projective_px <= limit_px:
+        with suppress(np.linalg.LinAlgError):  # raised at the first model that the points do not determine
+            models.extend(_solve_models(points, pixels, (width, height), projective_px))
+    far_px = max(_FAR_PX, _FAR * min((model.worst_px for model in models), default=math.inf))
+    model = min(models, key=lambda model: model.criterion(far_px), default=None)
     if model is None or model.worst_px > limit_px:
         return None
     # relative uncertainty of the focal length, which is large if points nearly lie in a plane in front of the camera
@@ -95,28 +101,13 @@ def calibrate(pairs: Correspondences, width: int, height: int) -> Calibration | 
     return Calibration(Cameras(viewmats[solved], model.Ks[solved], width, height), model.worst_px)
 
 
-def _choose_model(
-    points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], size: Size, projective_px: float
-) -> _Model | None:
-    """Choose the simplest intrinsics that explain the pixels; None if the points determine no model.
-
-    ``points`` and ``pixels`` are ``[n,3]`` and ``[n,2]`` for each view. ``projective_px`` is the error of the best
-    projective cameras, in pixels.
-    """
-    models: list[_Model] = []
-    with suppress(np.linalg.LinAlgError):  # raised at the first model that the points do not determine
-        models.extend(_solve_models(points, pixels, size, projective_px))
-    far_px = max(_FAR_PX, _FAR * min((model.worst_px for model in models), default=math.inf))
-    return min(models, key=lambda model: model.criterion(far_px), default=None)
-
-
 def _solve_models(
     points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], size: Size, projective_px: float
 ) -> Iterator[_Model]:
     """Yield models from simple to complex: with intrinsics common to all views, then with intrinsics for each view.
 
-    Models with intrinsics for each view are left out if the error of common intrinsics is as small as
-    ``projective_px``, the error of the best projective cameras.
+    ``points`` and ``pixels`` are ``[n,3]`` and ``[n,2]`` for each view. Models with intrinsics for each view are left
+    out if the error of common intrinsics is as small as ``projective_px``, the error of the best projective cameras.
     """
     one_focal_models = []
     first_focals = (1.2, 4.8)  # focal lengths, in longer sides of the picture, at which the search begins

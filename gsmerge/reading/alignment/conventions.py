@@ -128,24 +128,31 @@ def move_cameras(
     # perhaps the poses are right, and the intrinsics wrong
     refitted = _fit_intrinsics(pairs, cameras, after.worst_px)
     if refitted is not None:
-        _check_assumed(cameras, refitted, before.worst_px, source)
-        return MovedCameras(refitted, before.worst_px, [])
+        # only principal points in the middle of the image were just assumed
+        factors = refitted.Ks[0, (0, 1), (0, 1)] / cameras.Ks[0, (0, 1), (0, 1)]
+        same_focal = 0.01  # largest relative difference of focal lengths that count as equal
+        middle = cameras.width / 2, cameras.height / 2
+        if (cameras.Ks[:, :2, 2] == middle).all() and (np.abs(factors - 1) <= same_focal).all():
+            return MovedCameras(refitted, before.worst_px, [])
+        x, y = (refitted.Ks[:, :2, 2] - cameras.Ks[:, :2, 2]).mean(0)
+        raise SceneError(
+            source,
+            f"expected intrinsics that fit the Gaussians, found ones that put them {before.worst_px:.1f} px off their"
+            " pixels in the same way in every view",
+            f"multiply fx by {factors[0]:.4g} and fy by {factors[1]:.4g}, and add {x:.2f} to cx and {y:.2f} to cy"
+            f" (pixels of {cameras.width} x {cameras.height})",
+        )
+    # Photos confirm the poses as read if photos of the same Gaussians agree better with these. The Gaussians lie where
+    # the moved cameras show them. To compare both, the Gaussians of each view are moved back with its camera
+    confirmed = False
+    if len(images):
+        motions = matmul(invert(cameras.viewmats), viewmats)[pairs.views]
+        points = transform(motions[:, :3, :3], pairs.points) + motions[:, :3, 3]
+        better_share = 0.96  # the poses are better if they reduce the disagreement between photos to this share
+        limit = better_share * _measure_disagreement(pairs.points, pairs, images, moved)
+        confirmed = _measure_disagreement(points, pairs, images, cameras) < limit
     depth = float(np.median(camera_depths(pairs.points, viewmats[pairs.views])))
-    confirmed = len(images) > 0 and _photos_confirm(pairs, images, cameras, moved)
     return MovedCameras(moved, before.worst_px, list_moves(names, cameras.viewmats, viewmats, depth), confirmed)
-
-
-def _photos_confirm(pairs: Correspondences, images: np.ndarray, cameras: Cameras, moved: Cameras) -> bool:
-    """Return True if photos of the same Gaussians agree better with ``cameras`` than with the ``moved`` cameras.
-
-    The Gaussians lie where the moved cameras show them. To compare both, the Gaussians of each view are moved back with
-    its camera.
-    """
-    motions = matmul(invert(cameras.viewmats), moved.viewmats)[pairs.views]
-    points = transform(motions[:, :3, :3], pairs.points) + motions[:, :3, 3]
-    better_share = 0.96  # the poses are better if they reduce the disagreement between photos to this share
-    limit = better_share * _measure_disagreement(pairs.points, pairs, images, moved)
-    return _measure_disagreement(points, pairs, images, cameras) < limit
 
 
 def _measure_disagreement(points: np.ndarray, pairs: Correspondences, images: np.ndarray, cameras: Cameras) -> float:
@@ -204,24 +211,3 @@ def _fit_intrinsics(pairs: Correspondences, cameras: Cameras, moved_px: float) -
     refitted = replace(cameras, Ks=Ks)
     check = check_pairs(pairs, refitted)
     return refitted if check.ok and is_as_near(check.worst_px, moved_px) else None
-
-
-def _check_assumed(cameras: Cameras, refitted: Cameras, before_px: float, source: str) -> None:
-    """Raise SceneError unless ``refitted`` differs from ``cameras`` only in principal points that were just assumed.
-
-    Principal points count as assumed if all are in the middle of the image. ``before_px`` is the median error of
-    ``cameras``, in pixels. ``source`` names the intrinsics in the error.
-    """
-    factors = refitted.Ks[0, (0, 1), (0, 1)] / cameras.Ks[0, (0, 1), (0, 1)]
-    middle = cameras.width / 2, cameras.height / 2
-    same_focal = 0.01  # largest relative difference of focal lengths that count as equal
-    if (cameras.Ks[:, :2, 2] == middle).all() and (np.abs(factors - 1) <= same_focal).all():
-        return
-    x, y = (refitted.Ks[:, :2, 2] - cameras.Ks[:, :2, 2]).mean(0)
-    raise SceneError(
-        source,
-        f"expected intrinsics that fit the Gaussians, found ones that put them {before_px:.1f} px off their pixels in"
-        " the same way in every view",
-        f"multiply fx by {factors[0]:.4g} and fy by {factors[1]:.4g}, and add {x:.2f} to cx and {y:.2f} to cy"
-        f" (pixels of {cameras.width} x {cameras.height})",
-    )

@@ -1,4 +1,4 @@
-"""Find pixels from rows alone, if rows are sorted by view, line and column, and some pixels have no row.
+"""Find pixels and cameras from rows alone, if rows are sorted by view, line and column; some pixels may have no row.
 
 If borders and far pixels have no rows, lines in the middle of views may still be complete. Between complete lines, the
 long step from the right edge back to the left repeats at equal distances. A projective camera is solved from a few
@@ -9,13 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
+from pathlib import Path
 
 import numpy as np
 
+from gsmerge.geometry.transforms import median
+from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, StoredView, make_camera_file
 from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.reproject import follow_pixels
 from gsmerge.reading.alignment.calibration import Calibration, calibrate
-from gsmerge.reading.alignment.layouts import Layout
+from gsmerge.reading.alignment.layouts import ESTIMATED, Layout
 from gsmerge.reading.alignment.resection import projective_camera
 from gsmerge.reading.alignment.score import find_correspondences, is_as_near
 
@@ -34,6 +38,43 @@ _AHEAD, _MIN_AHEAD = 0.3, 2
 _MIN_PLACED = 0.9  # share of the rows that must have a pixel
 
 
+def estimate_cameras(path: Path, means: np.ndarray, valid: np.ndarray) -> CameraFile | None:
+    """Estimate the cameras of rows ``means [n,3]`` that are the pixels of a grid; None for other rows.
+
+    The rows are sorted by view, line and column, or by line, column and view. In both orders some pixels may have no
+    row. ``valid [n]`` bool marks the finite rows, and ``path`` is for messages.
+    """
+    # The step in rows from a pixel to the next pixel of the same view: at this distance in rows, pairs of points are
+    # nearest to each other. The step is the number of views if rows are sorted by line, column and view. For other
+    # rows, and for few rows, the step is 1
+    rows, step = np.arange(len(means)), 1
+    most_views = 64  # largest step that is tried
+    min_pixels = 256  # fewest pixels of a view
+    longest = min(most_views, len(means) // min_pixels)
+    if longest > 0:
+        num_samples = 2000  # pairs of rows whose distance is measured for each step
+        starts = np.linspace(0, max(0, len(means) - longest - 1), num_samples).astype(int)
+        distances = [np.abs(means[starts + apart] - means[starts]).sum(1) for apart in range(1, longest + 1)]
+        step = 1 + int(np.argmin([median(values[np.isfinite(values)]) for values in distances]))
+    orders = (rows, rows.reshape(-1, step).T.reshape(-1)) if step > 1 and len(rows) % step == 0 else (rows,)
+    # a row that is not finite may have a pixel, and is then interpolated, or may have no pixel; both are tried
+    interpolated = np.stack([np.interp(rows, rows[valid], values) for values in means[valid].T], 1).astype(np.float32)
+    point_sets = [(means, valid)] if valid.all() else [(means, valid), (interpolated, np.ones_like(valid))]
+    for order, (points, used) in product(orders, point_sets):
+        grid = find_dropped_grid(points[order], used[order])
+        if grid is not None:
+            layout, calibration = grid
+            pixel_ids = np.empty(len(rows), np.int64)
+            pixel_ids[order] = np.where(valid[order], layout.pixel_ids(), -1)
+            cameras = calibration.cameras
+            views = [
+                StoredView(f"view {view}", pose, K, (cameras.width, cameras.height))
+                for view, (pose, K) in enumerate(zip(cameras.viewmats[:, :3], cameras.Ks, strict=True))
+            ]
+            return replace(make_camera_file(path, ESTIMATED, W2C_OPENCV, views), pixel_ids=pixel_ids)
+    return None
+
+
 def find_dropped_grid(means: np.ndarray, valid: np.ndarray) -> tuple[Layout, Calibration] | None:
     """Find the pixels of rows ``means [n,3]`` and the cameras of their views, if some pixels have no row.
 
@@ -47,12 +88,19 @@ def find_dropped_grid(means: np.ndarray, valid: np.ndarray) -> tuple[Layout, Cal
     points -= np.median(points, 0)
     for length in _find_line_lengths(points):
         views = _find_views(points, length)
-        if sum(len(view.x) for view in views) >= _MIN_PLACED * len(rows):
-            layout = _make_layout(rows, views, len(means))
-            pairs = find_correspondences(means, valid, layout, _SOLVED_FROM)
-            calibration = calibrate(pairs, layout.width, layout.height)
-            if calibration is not None:
-                return layout, calibration
+        if sum(len(view.x) for view in views) < _MIN_PLACED * len(rows):
+            continue
+        # the views are laid out on grids of one size, so that all have about the same principal point
+        lefts, width = _choose_shifts([view.x for view in views], [_principal_coordinate(view, 0) for view in views])
+        tops, height = _choose_shifts([view.y for view in views], [_principal_coordinate(view, 1) for view in views])
+        ids = np.full(len(means), -1)
+        for number, (view, top, left) in enumerate(zip(views, tops, lefts, strict=True)):
+            # the numbers of a view's rows count only finite rows
+            ids[rows[view.rows]] = number * height * width + ((view.y + top) * width + view.x + left)
+        layout = Layout(len(views), width, height, ids=ids)
+        calibration = calibrate(find_correspondences(means, valid, layout, _SOLVED_FROM), width, height)
+        if calibration is not None:
+            return layout, calibration
     return None
 
 
@@ -115,7 +163,8 @@ def _find_views(points: np.ndarray, length: int) -> list[_GridView]:
 def _find_lines(points: np.ndarray, length: int) -> list[np.ndarray]:
     """Find series of rows that begin consecutive lines, ``length`` rows apart; the longest series first.
 
-    The first row of a line follows a long step back to the left, and lies near the first row of the line before.
+    The first row of a line follows a long step back to the left, and lies near the first row of the line before. No
+    line is in two series.
     """
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
     in_whole_lines = len(steps) // length * length
@@ -125,34 +174,18 @@ def _find_lines(points: np.ndarray, length: int) -> list[np.ndarray]:
     max_jumps = 100  # long steps per line; rows with more long steps are in no order
     if len(rows) * length > max_jumps * len(points):
         return []
-    return _collect_series(rows, _link_lines(rows, points[rows], _BELOW * steps[rows - 1], length))
-
-
-def _link_lines(rows: np.ndarray, points: np.ndarray, limits: np.ndarray, length: int) -> np.ndarray:
-    """Return for each of ``rows [r]``, which may begin lines, the index ``[r]`` of the line before it; -1 for none.
-
-    The line before begins ``length`` rows earlier. The first point of a line, among ``points [r,3]``, is less than
-    ``limits [r]`` from the first point of the line before.
-    """
-    before, least = np.full(len(rows), -1), limits
+    # the line before each line, or -1 for none; it begins `length` rows earlier, and is the nearest of these
+    firsts, before, least = points[rows], np.full(len(rows), -1), _BELOW * steps[rows - 1]
     for back in range(1, len(rows)):
         apart = rows[back:] - rows[:-back]
         if apart.min() > length:
             break
         ids = np.flatnonzero(apart == length)
-        distances = np.linalg.norm(points[ids + back] - points[ids], axis=1)
+        distances = np.linalg.norm(firsts[ids + back] - firsts[ids], axis=1)
         closer = distances < least[ids + back]
         ids, distances = ids[closer], distances[closer]
         before[ids + back], least[ids + back] = ids, distances
-    return before
-
-
-def _collect_series(rows: np.ndarray, before: np.ndarray) -> list[np.ndarray]:
-    """Collect series of consecutive lines, the longest series first; no line is in two series.
-
-    ``rows [r]`` begin the lines, and ``before [r]`` is the index of the line before each line, or -1 for none. The
-    result lists, for each series, the rows that begin its lines.
-    """
+    # series of consecutive lines
     num_before = np.zeros(len(rows), np.int64)  # number of lines before each line in its series
     for i, previous in enumerate(before.tolist()):
         num_before[i] = num_before[previous] + 1 if previous >= 0 else 0
@@ -178,20 +211,18 @@ def _solve_lines(points: np.ndarray, starts: np.ndarray) -> _GridView | None:
 
 
 def _drop_rare_columns(view: _GridView) -> _GridView:
-    """Leave out outer columns that few lines have, and number the other columns from 0."""
+    """Leave out outer columns that few lines have, and number the other columns from 0.
+
+    The camera of the result projects to the new pixels.
+    """
     first = int(view.x.min())
     counts = np.bincount(view.x - first)
     least_share = 0.05  # columns in a smaller share of the lines than the fullest column are left out
     common = first + np.flatnonzero(counts >= least_share * counts.max())
     inside = (view.x >= common[0]) & (view.x <= common[-1])
-    return _shift_columns(replace(view, rows=view.rows[inside], x=view.x[inside], y=view.y[inside]), -int(common[0]))
-
-
-def _shift_columns(view: _GridView, columns: int) -> _GridView:
-    """Add a number of columns to the pixels of a view, and change its camera so that it projects to the new pixels."""
     camera = view.camera.copy()
-    camera[0] += columns * camera[2]
-    return replace(view, x=view.x + columns, camera=camera)
+    camera[0] -= int(common[0]) * camera[2]
+    return replace(view, rows=view.rows[inside], x=view.x[inside] - int(common[0]), y=view.y[inside], camera=camera)
 
 
 def _extend_view(points: np.ndarray, free: np.ndarray, view: _GridView, width: int) -> _GridView:
@@ -245,21 +276,6 @@ def _solve_camera(points: np.ndarray, view: _GridView) -> _GridView:
     depths = matmul(points[view.rows[sample]], camera[2, :3]) + camera[2, 3]
     sign = np.copysign(1.0, np.median(depths))  # sign with which the points are in front of the camera
     return replace(view, camera=camera * sign, px=px)
-
-
-def _make_layout(rows: np.ndarray, views: list[_GridView], count: int) -> Layout:
-    """Lay out views on grids of one size, so that all have about the same principal point.
-
-    The layout has ``count`` rows, of which ``rows [m]`` are finite. The numbers of a view's rows count only finite
-    rows.
-    """
-    lefts, width = _choose_shifts([view.x for view in views], [_principal_coordinate(view, 0) for view in views])
-    tops, height = _choose_shifts([view.y for view in views], [_principal_coordinate(view, 1) for view in views])
-    pixels = tuple((view.y + top) * width + view.x + left for view, top, left in zip(views, tops, lefts, strict=True))
-    ids = np.full(count, -1)
-    for number, (view, view_pixels) in enumerate(zip(views, pixels, strict=True)):
-        ids[rows[view.rows]] = number * height * width + view_pixels
-    return Layout(len(views), width, height, ids=ids)
 
 
 def _choose_shifts(coordinates: Sequence[np.ndarray], middles: Sequence[float]) -> tuple[list[int], int]:

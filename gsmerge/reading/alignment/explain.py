@@ -6,20 +6,10 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.io.cameras.camera_file import CameraFile
-from gsmerge.io.formats.read_gaussians import FileInfo
 from gsmerge.reading.alignment.resection import projective_error
 from gsmerge.reading.alignment.score import Alignment, AlignmentInput, check_pairs, sample_pixels
 from gsmerge.reading.alignment.unaligned import MAX_FRONT_RATIO, check_cameras
 from gsmerge.types import Cameras, Gaussians
-
-
-def no_pixels_error(ply: FileInfo, cameras: Cameras) -> SceneError:
-    """Make the SceneError for rows that are not the pixels of the cameras; the error states both numbers."""
-    views, width, height = len(cameras), cameras.width, cameras.height
-    expected = f"{views} x {height} x {width} = {views * height * width} (views x height x width)"
-    actual = f"{ply.count} in no known order" if ply.count == views * height * width else str(ply.count)
-    problem = f"expected one Gaussian per pixel, {expected}, found {actual}"
-    return SceneError(ply.path, problem, "give the cameras of their views, in the frame of the Gaussians")
 
 
 def refuse_other_cameras(inputs: AlignmentInput, camera_file: CameraFile) -> None:

@@ -11,7 +11,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsmerge.arrays import distinct
 from gsmerge.geometry.transforms import (
     IDENTITY,
     Similarity,
@@ -114,12 +113,6 @@ def solve_frame(
         angle = np.linalg.norm(transform(projections, from_centres), axis=1) / depth
         weights = robust_weights(angle, 3, 1e-12, depth)
     return Similarity(rotation, float(scale), shift)
-
-
-def solve_poses(pairs: Correspondences, Ks: np.ndarray) -> dict[int, np.ndarray]:
-    """Solve for the pose ``[4,4]`` of each view from its own pixels; views whose solution fails are left out."""
-    poses = ((int(view), solve_pose(pairs, int(view), Ks[view])) for view in distinct(pairs.views))
-    return {view: pose for view, pose in poses if pose is not None}
 
 
 def solve_pose(pairs: Correspondences, view: int, K: np.ndarray) -> np.ndarray | None:

@@ -57,7 +57,11 @@ def refine_poses(
         current_K, current_poses, (curvature, slope, _) = state
         with np.errstate(all="ignore"):  # an overflowing step does not reduce the error, so it is rejected
             change, motions = _solve_normal_equations(curvature, slope, damping)
-            return linearise(_change_intrinsics(current_K, change), matmul(motion_matrices(motions), current_poses))
+            new_K = current_K.copy()
+            if free:
+                new_K[(0, 1), (0, 1)] *= 1 + change[:TWO_FOCALS]  # if one focal length is free, it counts for both
+                new_K[:2, 2] += change[TWO_FOCALS:] if free == ALL_INTRINSICS else 0
+            return linearise(new_K, matmul(motion_matrices(motions), current_poses))
 
     K, poses, _ = descend(linearise(K, poses), lambda fit: fit[2][2], step, POSE_DAMPING)  # [2][2]: the squared error
     return K, poses
@@ -103,15 +107,6 @@ def _solve_normal_equations(curvature: np.ndarray, slope: np.ndarray, damping: f
     return change, -solved[..., 0] - matmul(solved[..., 1:], change)
 
 
-def _change_intrinsics(K: np.ndarray, change: np.ndarray) -> np.ndarray:
-    """Return intrinsics changed by the parameters ``change [f]`` of :func:`_linearise`."""
-    K = K.copy()
-    if len(change):
-        K[(0, 1), (0, 1)] *= 1 + change[:TWO_FOCALS]  # if one focal length is free, its change counts for both
-        K[:2, 2] += change[TWO_FOCALS:] if len(change) == ALL_INTRINSICS else 0
-    return K
-
-
 def focal_uncertainty(
     points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], Ks: np.ndarray, poses: np.ndarray
 ) -> float:
@@ -149,7 +144,16 @@ def projective_camera(points: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarra
     """
     middle = medians(points)
     unit = median(np.abs(points - middle)) or 1.0
-    local, basis = _whiten((points - middle) / unit)
+    # homogeneous coordinates in a basis of equal second moments
+    homogeneous = np.concatenate([(points - middle) / unit, np.ones((len(points), 1))], 1)
+    homogeneous /= np.linalg.norm(homogeneous, axis=1, keepdims=True)
+    values, axes = eigh(matmul(homogeneous.T, homogeneous))
+    # points lie in a plane across an axis if the second moment along it is below this share of the largest second
+    # moment
+    flatness = 1e-10
+    used = values > flatness * values[-1]  # points in a plane or on a line do not determine the other axes
+    basis = axes[:, used] / np.sqrt(values[used])
+    local = matmul(homogeneous, basis)
     centre, size = pixels.mean(0), float(pixels.std()) or 1.0
     targets = (pixels - centre) / size
     zero = np.zeros_like(local)
@@ -174,19 +178,3 @@ def projective_camera(points: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarra
     camera[:, :3] /= unit
     camera[:, 3] -= matmul(camera[:, :3], middle)
     return camera, size * median(error)
-
-
-def _whiten(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return homogeneous coordinates ``[n,d]`` of points ``[n,3]`` in a basis of equal second moments, and the basis.
-
-    The basis ``[4,d]`` has fewer than four axes if the points lie in a plane or on a line.
-    """
-    homogeneous = np.concatenate([points, np.ones((len(points), 1))], 1)
-    homogeneous /= np.linalg.norm(homogeneous, axis=1, keepdims=True)
-    values, axes = eigh(matmul(homogeneous.T, homogeneous))
-    # points lie in a plane across an axis if the second moment along it is below this share of the largest second
-    # moment
-    flatness = 1e-10
-    used = values > flatness * values[-1]  # points in a plane or on a line do not determine the other axes
-    basis = axes[:, used] / np.sqrt(values[used])
-    return matmul(homogeneous, basis), basis

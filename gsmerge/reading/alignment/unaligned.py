@@ -122,22 +122,15 @@ def check_cameras(
             errors.append(_mean_difference(colors[seen], photo))
             shuffled_errors.append(_mean_difference(colors[seen], rng.permutation(photo)))
     share, num_compared = float(visible[: len(rows)].sum()) / max(1, len(rows)), int(compared.sum())
-    ratio, error = _color_ratio(errors, shuffled_errors, num_compared)
+    # the mean colour error, divided by the mean colour error of shuffled pixels, and the ratio's standard error
+    ratio = error = np.nan
+    min_error = 0.01  # colour error of shuffled pixels below which colours vary too little to decide
+    if errors and (mean_shuffled := float(np.concatenate(shuffled_errors).mean())) > min_error:
+        ratio = float(np.concatenate(errors).mean()) / mean_shuffled
+        residuals = np.concatenate(errors) - ratio * np.concatenate(shuffled_errors)  # with a mean of 0
+        error = float(np.sqrt(np.square(residuals).mean() / num_compared)) / mean_shuffled
     min_seen = 0.5  # share of the Gaussians that must be in some camera
     return CameraCheck(share, ratio, share >= min_seen and not ratio > RANDOM_SHARE, num_compared, error)
-
-
-def _color_ratio(errors: list[np.ndarray], shuffled: list[np.ndarray], count: int) -> tuple[float, float]:
-    """Divide the mean colour error by the mean colour error of shuffled pixels; also return the ratio's standard error.
-
-    ``count`` is the number of Gaussians. Both results are NaN if the colours hardly vary.
-    """
-    min_error = 0.01  # colour error of shuffled pixels below which colours vary too little to decide
-    if not errors or not (mean_shuffled := float(np.concatenate(shuffled).mean())) > min_error:
-        return np.nan, np.nan
-    ratio = float(np.concatenate(errors).mean()) / mean_shuffled
-    residuals = np.concatenate(errors) - ratio * np.concatenate(shuffled)  # with a mean of 0
-    return ratio, float(np.sqrt(np.square(residuals).mean() / count)) / mean_shuffled
 
 
 def _mean_difference(colors: np.ndarray, other_colors: np.ndarray) -> np.ndarray:

@@ -91,51 +91,35 @@ def _possible_orders(count: int, cameras: Cameras) -> Iterator[tuple[np.ndarray,
 
     Each order is a pair: the pixels ``[p]`` of a photo that have rows, and the stretches of rows to search for in them.
     """
-    # exporters that write interleaved rows cut off a border
-    grid, trim = np.arange(cameras.width * cameras.height).reshape(cameras.height, cameras.width), TRIMS[0]
-    trimmed, whole = grid[trim:-trim, trim:-trim].reshape(-1), grid.reshape(-1)
+    grid, views = np.arange(cameras.width * cameras.height).reshape(cameras.height, cameras.width), len(cameras)
+    # Rows that are sorted by line, column, layer and view, where some rows are missing. Exporters that write them cut
+    # off a border
+    trim = TRIMS[0]
+    trimmed = grid[trim:-trim, trim:-trim].reshape(-1)
     per_pixel_counts = (1, 2, 3)  # possible numbers of Gaussians of a pixel
     for per_pixel in per_pixel_counts:
-        stretches = _interleaved_stretches(count, len(cameras), per_pixel, len(trimmed))
-        if stretches:
-            yield trimmed, stretches
-    stretches = _fused_stretches(count, len(cameras), len(whole))
-    if stretches:
-        yield whole, stretches
-
-
-def _interleaved_stretches(count: int, views: int, per_pixel: int, num_pixels: int) -> list[_Stretch]:
-    """List stretches of rows that are sorted by line, column, layer and view, where some rows are missing.
-
-    Each view has ``num_pixels`` pixels with ``per_pixel`` rows. The list is empty if ``count`` rows cannot have this
-    order.
-    """
-    step = views * per_pixel
-    dropped = num_pixels * step - count
-    if not (0 <= dropped < count and count >= _LENGTH * step):
-        return []
-    starts = np.unique(np.linspace(0, count - _LENGTH * step, _STRETCHES).astype(int)).tolist()
-    return [
-        _Stretch(view, start, step, start // step - _SLACK, (start + dropped) // step + _SLACK)
-        for start in starts
-        for view in range(views)
-    ]
-
-
-def _fused_stretches(count: int, views: int, num_pixels: int) -> list[_Stretch]:
-    """List stretches of rows of the first and the last view, if views of ``num_pixels`` pixels were fused in order.
-
-    ``count`` is the number of all rows. The rows of the first view come first, and the rows of the last view last. The
-    list is empty for too few or too many rows.
-    """
+        step = views * per_pixel
+        dropped = len(trimmed) * step - count
+        if 0 <= dropped < count and count >= _LENGTH * step:
+            starts = np.unique(np.linspace(0, count - _LENGTH * step, _STRETCHES).astype(int)).tolist()
+            yield (
+                trimmed,
+                [
+                    _Stretch(view, start, step, start // step - _SLACK, (start + dropped) // step + _SLACK)
+                    for start in starts
+                    for view in range(views)
+                ],
+            )
+    # Fused views, in order: the rows of the first view come first, and the rows of the last view last
     num_parts = 3  # stretches of fused views are taken from the first and the last third of the rows
-    if not num_parts * _LENGTH <= count < views * num_pixels:
-        return []
-    starts = np.unique(np.linspace(0, count // num_parts, _STRETCHES).astype(int)).tolist()
-    first_view = [_Stretch(0, start, 1, low=start - _SLACK, high=num_pixels) for start in starts]
-    last_starts = [count - _LENGTH - start for start in starts]  # at the same distances from the last row
-    last_view = [_Stretch(views - 1, last, 1, low=0, high=last - count + num_pixels + _SLACK) for last in last_starts]
-    return first_view + last_view
+    if num_parts * _LENGTH <= count < views * grid.size:
+        starts = np.unique(np.linspace(0, count // num_parts, _STRETCHES).astype(int)).tolist()
+        first_view = [_Stretch(0, start, 1, low=start - _SLACK, high=grid.size) for start in starts]
+        last_starts = [count - _LENGTH - start for start in starts]  # at the same distances from the last row
+        last_view = [
+            _Stretch(views - 1, last, 1, low=0, high=last - count + grid.size + _SLACK) for last in last_starts
+        ]
+        yield grid.reshape(-1), first_view + last_view
 
 
 def _match_stretches(
@@ -147,8 +131,25 @@ def _match_stretches(
     with their pixels. The stretch of a row is its number among the stretches that match.
     """
     rows = np.array([stretch.start + stretch.step * np.arange(_LENGTH) for stretch in stretches])
-    places, costs, second_costs = _place_stretches(inputs, stretches, rows, pixels).T
+    with np.errstate(invalid="ignore"):
+        colors = np.nan_to_num(sh0_to_rgb(inputs.gaussians.sh0[:, 0])).clip(0, 1).astype(np.float32)
+    # The best place of each stretch, the cost at this place, and the least cost elsewhere. A cost is the sum of squared
+    # differences of colours. A place is elsewhere if it is more than two pixels from the best place
+    found = []
+    no_place = 1e9  # cost of a stretch that cannot be in its photo
+    for stretch, stretch_rows in zip(stretches, rows, strict=True):
+        low, high = max(0, stretch.low), min(len(pixels), stretch.high + _LENGTH)
+        if high - low < _LENGTH:
+            found.append((0, no_place, 0.0))
+            continue
+        shown = inputs.images[stretch.view].reshape(1, -1, 3)[:, pixels[low:high]]
+        place_costs = cv2.matchTemplate(shown, colors[stretch_rows][None], cv2.TM_SQDIFF)[0]
+        best = int(place_costs.argmin())
+        elsewhere = np.concatenate([place_costs[: max(0, best - 2)], place_costs[best + 3 :]])
+        found.append((low + best, float(place_costs[best]), float(elsewhere.min(initial=no_place))))
+    places, costs, second_costs = np.array(found).T
     places = places.astype(int)
+    # stretches that match
     max_cost = 9.0  # largest cost of a stretch that matches, divided by the lower quartile of all costs
     min_cost = 1e-3  # costs below this count as equal
     is_near = costs <= max_cost * max(min_cost, float(np.quantile(costs, 0.25)))
@@ -164,31 +165,6 @@ def _match_stretches(
     points = inputs.gaussians.means[ids].astype(np.float64)
     valid = inputs.valid[ids]
     return Correspondences(points, np.stack([x, y], 1) + 0.5, views).select(valid), parts[valid]
-
-
-def _place_stretches(
-    inputs: AlignmentInput, stretches: Sequence[_Stretch], rows: np.ndarray, pixels: np.ndarray
-) -> np.ndarray:
-    """Return for each stretch its best place, the cost at this place, and the least cost elsewhere ``[s,3]``.
-
-    A cost is the sum of squared differences of colours. A place is elsewhere if it is more than two pixels from the
-    best place. ``rows [s,l]`` are the rows of the stretches, which are searched among the ``pixels [p]`` of a photo.
-    """
-    with np.errstate(invalid="ignore"):
-        colors = np.nan_to_num(sh0_to_rgb(inputs.gaussians.sh0[:, 0])).clip(0, 1).astype(np.float32)
-    places = []
-    no_place = 1e9  # cost of a stretch that cannot be in its photo
-    for stretch, stretch_rows in zip(stretches, rows, strict=True):
-        low, high = max(0, stretch.low), min(len(pixels), stretch.high + _LENGTH)
-        if high - low < _LENGTH:
-            places.append((0, no_place, 0.0))
-            continue
-        shown = inputs.images[stretch.view].reshape(1, -1, 3)[:, pixels[low:high]]
-        costs = cv2.matchTemplate(shown, colors[stretch_rows][None], cv2.TM_SQDIFF)[0]
-        best = int(costs.argmin())
-        elsewhere = np.concatenate([costs[: max(0, best - 2)], costs[best + 3 :]])
-        places.append((low + best, float(costs[best]), float(elsewhere.min(initial=no_place))))
-    return np.array(places)
 
 
 def _solve_agreed_frame(
