@@ -50,24 +50,20 @@ def read_input(
     loaded = load_files(files, opacity=opacity, hints=hints)
     # The scene already has the photos that were inside the camera file, so the copy in ``loaded`` is freed
     cameras = None if loaded.cameras is None else replace(loaded.cameras, images=())
-    sha256 = file_sha256(*files.all_plys) if hashed else None
+    plys = (ply for scene_files in (files, *files.more) for ply in scene_files.plys)
+    sha256 = file_sha256(*plys) if hashed else None
     if changed := list_changed(stats):
         raise SceneError(changed[0], "changed while it was read", "run this again when the file is complete")
     release_memory()
-    return replace(loaded, cameras=cameras, stats=stats, sha256=sha256, notes=(*loaded.notes, *_compact_notes(loaded)))
-
-
-def _compact_notes(loaded: Loaded) -> list[str]:
-    """Return notes on columns that the result will lack, and on a scene that is a result already.
-
-    A file of gsmerge is recognised by its header or, in formats without one, by the cameras beside it. A file of
-    gsmerge is a result if its header says so, or if it has at most one Gaussian for every two pixels of its views.
-    """
-    scene, comments, notes = loaded.scene, loaded.info.comments, list[str]()
+    # columns that the result will lack
+    scene, comments, notes = loaded.scene, loaded.info.comments, [*loaded.notes]
     told = {name for note in split_notes(loaded.info.adapted, "columns")[0] for name in note.names}
     lost = [name for name in loaded.info.extra_columns if name not in told]
     if lost:
         notes.append(f"merged Gaussians do not have the columns {list_names(lost)}; gsmerge convert copies them")
+    # A scene that is a result already. A file of gsmerge is recognised by its header or, in formats without one, by the
+    # cameras beside it. It is a result if its header says so, or if it has at most one Gaussian for every two pixels of
+    # its views
     pixels = len(scene) * scene.cameras.height * scene.cameras.width
     is_own = is_from_gsmerge(comments) or result_cameras(loaded.files.ply) is not None
     is_small = is_own and scene.num_gaussians <= pixels / 2
@@ -75,7 +71,7 @@ def _compact_notes(loaded: Loaded) -> list[str]:
         count = f"{scene.num_gaussians:,} Gaussians for {pixels:,} pixels" if pixels else "no Gaussian per pixel"
         remedy = "start from the original for more detail"
         notes.append(f"the scene is compact already ({count}, written by gsmerge): {remedy}")
-    return notes
+    return replace(loaded, cameras=cameras, stats=stats, sha256=sha256, notes=tuple(notes))
 
 
 def check_scene(scene: Scene) -> None:

@@ -20,6 +20,7 @@ from gsmerge.io.photo_files import (
     resize_to,
 )
 from gsmerge.kernels.matrices import matmul
+from gsmerge.reading.alignment import estimate_cameras
 from gsmerge.reading.photos.masks import NO_MASKS, Masks, read_masks
 from gsmerge.reading.photos.scene_photos import ScenePhotos
 from gsmerge.reading.scene_files import SceneFiles
@@ -46,8 +47,6 @@ def read_scene_cameras(ply: GaussianFile, files: SceneFiles) -> CameraFile | Non
     sharp = None if "cameras" in files.named else read_sharp_camera(files.ply)
     if sharp is not None:
         return sharp
-    from gsmerge.reading.alignment import estimate_cameras  # few files need it
-
     return estimate_cameras(files.ply, ply.gaussians.means, ply.valid)
 
 
@@ -76,7 +75,15 @@ def find_larger_and_masks(
     stored = photos.file_size or photo_size(photos.pictures)
     if stored is None or source.size is None:
         return None, NO_MASKS, []
-    window = _file_window(stored, source.size, source.transform, cameras)
+    # The part of each photo's file that its view shows: the window. All arrays hold x and y
+    to_grid = source.transform or resize_to(source.size, source.size)
+    # from pixels of the file to a grid
+    scale = np.array([to_grid.scale_x, to_grid.scale_y]) * source.size / np.array(stored)
+    corner, grid_size = np.array([to_grid.left, to_grid.top]), np.array([to_grid.width, to_grid.height])
+    reduction = np.array([cameras.width, cameras.height]) / grid_size  # views of unaligned scenes may be reduced again
+    start = np.floor(corner / scale).astype(int)
+    stop = np.minimum(np.ceil((corner + grid_size) / scale - _EDGE_ROUNDING).astype(int), stored)
+    (left, top), (right, bottom) = start.tolist(), stop.tolist()
     lenses = camera_file.lenses if photos.paths else ()
     Ks = to_cameras(replace(camera_file, lenses=()), stored).Ks if lenses else None
 
@@ -84,7 +91,7 @@ def find_larger_and_masks(
         """Undistort a picture of the upright photo's size, and crop it to what the view shows."""
         if Ks is not None:
             picture = undistort_photos([picture], Ks[view : view + 1], lenses[view : view + 1])[0]
-        return np.ascontiguousarray(picture[window.rows, window.columns])
+        return np.ascontiguousarray(picture[top:bottom, left:right])
 
     def read(view: int) -> np.ndarray:
         """Return the larger photo of a view."""
@@ -93,39 +100,13 @@ def find_larger_and_masks(
         return cut(view, decode_photos([photos.paths[view]], [photos.turns[view]], stored, photos.fit.part)[0])
 
     large = None
-    if window.is_larger:
-        width, height = (pixels.stop - pixels.start for pixels in (window.columns, window.rows))
-        large = LargePhotos(matmul(window.to_file, cameras.Ks), width, height, tuple(range(len(cameras))), read)
+    if (scale * reduction).max() < 1:  # the window has more pixels than the view on both sides
+        to_file = np.eye(3)  # maps pixels of the view to pixels of the window
+        to_file[(0, 1), (0, 1)] = 1 / (scale * reduction)
+        to_file[:2, 2] = corner / scale - start
+        Ks_of_file = matmul(to_file, cameras.Ks)
+        large = LargePhotos(Ks_of_file, right - left, bottom - top, tuple(range(len(cameras))), read)
     return large, *read_masks(files, camera_file, photos, stored, cut, cameras)
-
-
-@dataclass(frozen=True, eq=False)
-class _Window:
-    """The part of a photo's file that a view shows."""
-
-    rows: slice
-    columns: slice
-    to_file: np.ndarray  # [3,3] maps pixels of the view to pixels of the window
-    is_larger: bool  # whether the window has more pixels than the view on both sides
-
-
-def _file_window(stored: Size, size: Size, transform: PhotoTransform | None, cameras: Cameras) -> _Window:
-    """Find the part of a photo's file that the view shows, for files of the size ``stored``.
-
-    ``size`` and ``transform`` are as in :class:`PhotoSource`.
-    """
-    # all arrays hold x and y
-    to_grid = transform or resize_to(size, size)
-    scale = np.array([to_grid.scale_x, to_grid.scale_y]) * size / np.array(stored)  # from pixels of the file to a grid
-    corner, grid_size = np.array([to_grid.left, to_grid.top]), np.array([to_grid.width, to_grid.height])
-    reduction = np.array([cameras.width, cameras.height]) / grid_size  # views of unaligned scenes may be reduced again
-    start = np.floor(corner / scale).astype(int)
-    stop = np.minimum(np.ceil((corner + grid_size) / scale - _EDGE_ROUNDING).astype(int), stored)
-    to_file = np.eye(3)
-    to_file[(0, 1), (0, 1)] = 1 / (scale * reduction)
-    to_file[:2, 2] = corner / scale - start
-    (left, top), (right, bottom) = start.tolist(), stop.tolist()
-    return _Window(slice(top, bottom), slice(left, right), to_file, bool((scale * reduction).max() < 1))
 
 
 def limit_photo_size(

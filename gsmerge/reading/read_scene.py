@@ -20,7 +20,7 @@ from gsmerge.io.formats.read_gaussians import GaussianFile, file_notes, read_gau
 from gsmerge.io.formats.rows import MAX_STRAY, RESULT_COMMENT
 from gsmerge.io.image_names import IMAGE_PLACES, IMAGE_SUFFIXES, describe_unread
 from gsmerge.io.photo_files import NO_IMAGES, as_floats, photo_size
-from gsmerge.reading.alignment import AlignmentResult, align, check_pixels
+from gsmerge.reading.alignment import AlignmentResult, align, check_cameras, check_pixels
 from gsmerge.reading.exporters import (
     NO_HINTS,
     ReadHints,
@@ -156,11 +156,9 @@ def load_files(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: Rea
             align_scene(read_gaussian_file(scene_files, opacity=opacity, hints=hints), scene_files, hints=hints)
             for scene_files in (replace(files, more=()), *files.more)
         ]
-    return loads[0] if len(loads) == 1 else _join_loads(loads, files)
-
-
-def _join_loads(loads: Sequence[Loaded], files: SceneFiles) -> Loaded:
-    """Join several scenes of the same place into one scene, which has the notes of all scenes."""
+    if len(loads) == 1:
+        return loads[0]
+    # several scenes of the same place become one scene, which has the notes of all scenes
     from gsmerge.reading.alignment.registration.join import join_scenes
 
     joined = join_scenes([load.scene for load in loads], [load.files.ply for load in loads])
@@ -378,7 +376,12 @@ def _make_scene_with_views(
     ply: GaussianFile, files: SceneFiles, hints: ReadHints, camera_file: CameraFile, photos: ScenePhotos
 ) -> Loaded:
     """Combine Gaussians, cameras and photos. Raises SceneError if the cameras or the photos cannot be used."""
-    order = _choose_row_order(ply, camera_file, hints)
+    # the order of the rows is that of the hints, of the named exporter, or of the format of the cameras
+    order: str = hints.order
+    if order == "auto":
+        order = (find_exporter(hints.exporter) or camera_file).order
+        if order == "auto" and RESULT_COMMENT in ply.info.comments:
+            order = "none"  # results have no pixels
     pinholes, pictures, notes = as_pinholes(camera_file, photos.pictures)
     limited, size_notes = limit_photo_size(pictures, len(ply.gaussians), hints.max_side, unaligned=order == "none")
     if files.is_state and files.cameras == files.ply:  # the cameras of a state fit its Gaussians, so none are aligned
@@ -429,14 +432,6 @@ def _add_larger_and_masks(load: Loaded) -> Loaded:
         counts = scene.masks if counts is None else counts & scene.masks
     scene = replace(scene, large_photos=large, masks=counts, importance=masks.importance)
     return replace(load, scene=scene, source=None, notes=(*load.notes, *notes, *mask_notes, *check_notes))
-
-
-def _choose_row_order(ply: GaussianFile, camera_file: CameraFile, hints: ReadHints) -> str:
-    """Choose the order of the rows by the hints, by the named exporter, or by the format of the cameras."""
-    if hints.order != "auto":
-        return hints.order
-    order = (find_exporter(hints.exporter) or camera_file).order
-    return "none" if order == "auto" and RESULT_COMMENT in ply.info.comments else order  # results have no pixels
 
 
 def _make_scene_without_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> Loaded:
@@ -523,27 +518,14 @@ def move_cameras_to_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHi
     for with_photos in dict.fromkeys((True, photos)):  # photos help to find the frame even if they are not needed
         with suppress(SceneError):
             return align_scene(ply, files, hints=hints, photos=with_photos, keeps_cameras=True)
+    # The cameras as stored in their file. Cameras that the caller did not name have to see the Gaussians
     with suppress(SceneError):
-        kept = _keep_stored_cameras(ply, files, hints, photos=photos)
-        if kept is not None:
-            return kept
+        camera_file = read_scene_cameras(ply, files)
+        if camera_file is not None:
+            pictures = stored_photos(files, camera_file) if photos else ()
+            cameras = to_cameras(camera_file, photo_size(pictures))
+            if "cameras" in files.named or check_cameras(ply.gaussians, ply.valid, cameras, NO_IMAGES).ok:
+                doubt = Doubt("the cameras do not fit the Gaussians; they stay as stored in their file")
+                as_stored = AlignmentResult(None, cameras, as_floats(pictures), camera_file)
+                return replace(_make_loaded(ply, files, hints, as_stored, [doubt]), cameras=None)
     return align_scene(ply, files, hints=hints, photos=photos)  # this leaves out files that were not named
-
-
-def _keep_stored_cameras(ply: GaussianFile, files: SceneFiles, hints: ReadHints, *, photos: bool) -> Loaded | None:
-    """Return the scene with the cameras as stored in their file, and a doubt that they do not fit.
-
-    Returns None without cameras, and for cameras that the caller did not name and that do not see the Gaussians.
-    """
-    from gsmerge.reading.alignment import check_cameras  # few scenes need it
-
-    camera_file = read_scene_cameras(ply, files)
-    if camera_file is None:
-        return None
-    pictures = stored_photos(files, camera_file) if photos else ()
-    cameras = to_cameras(camera_file, photo_size(pictures))
-    if "cameras" not in files.named and not check_cameras(ply.gaussians, ply.valid, cameras, NO_IMAGES).ok:
-        return None
-    doubt = Doubt("the cameras do not fit the Gaussians; they stay as stored in their file")
-    as_stored = AlignmentResult(None, cameras, as_floats(pictures), camera_file)
-    return replace(_make_loaded(ply, files, hints, as_stored, [doubt]), cameras=None)

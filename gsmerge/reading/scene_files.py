@@ -100,11 +100,6 @@ class SceneFiles:
         return self.parts or (self.ply,)
 
     @property
-    def all_plys(self) -> tuple[Path, ...]:
-        """Paths of all files of Gaussians, first of this scene, then of the scenes in ``more``."""
-        return tuple(ply for files in (self, *self.more) for ply in files.plys)
-
-    @property
     def paths(self) -> tuple[Path, ...]:
         """Paths of all files and folders from which the scene is read: Gaussians, cameras and pictures."""
         beside = (self.cameras, self.images, self.masks, self.protect, *self.others)
@@ -411,33 +406,24 @@ def find_plys(folder: Path, cameras: Path | None = None) -> list[Path]:
         raise _no_gaussians(folder)
     if len(plys) == 1:
         return plys
-    with suppress(OSError):  # numbered files may be copies: Flash3D writes one for each rendered view
-        if _are_numbered(plys) and all(filecmp.cmp(plys[0], path, shallow=False) for path in plys[1:]):
-            return plys[:1]
     in_one_folder = len({path.parent for path in plys}) == 1
+    are_numbered = in_one_folder and all(_NUMBERED.fullmatch(path.name) for path in plys)
+    with suppress(OSError):  # numbered files may be copies: Flash3D writes one for each rendered view
+        if are_numbered and all(filecmp.cmp(plys[0], path, shallow=False) for path in plys[1:]):
+            return plys[:1]
     parts = _order_parts(folder, plys, cameras or find_cameras(folder)) if in_one_folder else None
-    if parts is None:
-        raise _several_scenes(folder, plys)
-    return parts
-
-
-def _are_numbered(plys: Sequence[Path]) -> bool:
-    """Return whether all files are in one folder and have names that end in numbers."""
-    return len({path.parent for path in plys}) == 1 and all(_NUMBERED.fullmatch(path.name) for path in plys)
-
-
-def _several_scenes(folder: Path, plys: Sequence[Path]) -> SceneError:
-    """Make the error for a folder with several files of Gaussians, with the commands for scenes, moments and parts."""
-    places = {path.parent for path in plys}
-    start = places.pop() if len(places) == 1 else folder
+    if parts is not None:
+        return parts
+    # several scenes, or moments or parts of one; the error has the commands for each
+    start = plys[0].parent if in_one_folder else folder
     problem = f"expected one .ply file in the folder, found {len(plys)}"
     names = ", ".join(path.relative_to(start).as_posix() for path in plys[:4]) + ", ..." * (len(plys) > 4)
-    if not _are_numbered(plys):
-        return SceneError(folder, f"{problem} ({names})", "name one, or give the folder to gsmerge batch")
+    if not are_numbered:
+        raise SceneError(folder, f"{problem} ({names})", "name one, or give the folder to gsmerge batch")
     counts = {header_counts(path)[0] for path in plys[:_MAX_HEADERS]}
     kind = f"moments of {counts.pop():,} Gaussians each" if len(counts) == 1 else "moments or parts"
     calls = f"gsmerge batch {start} for all moments, or gsmerge convert {start}/*.ply one.ply to join parts of a scene"
-    return SceneError(folder, f"{problem} ({names}), numbered like {kind}", f"name one, or run {calls}")
+    raise SceneError(folder, f"{problem} ({names}), numbered like {kind}", f"name one, or run {calls}")
 
 
 def list_plys(folder: Path) -> list[Path]:

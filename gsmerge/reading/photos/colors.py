@@ -75,9 +75,24 @@ def cut_blocks(pairs: Pairs) -> Blocks:
 def fit_tones(colors: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Fit a tone curve ``[3,256]`` that maps the quantiles of ``colors`` to those of ``targets``, channel by channel.
 
-    Colours and targets are ``[n,3]``, with ``weights [n]``. Wrong depth and noise hardly change quantiles.
+    Colours and targets are ``[n,3]``, with ``weights [n]``. Wrong depth and noise hardly change quantiles. Levels below
+    and above all quantiles are mapped in proportion.
     """
-    return np.stack([_join_quantiles(colors[:, channel], targets[:, channel], weights) for channel in range(3)])
+    used = weights > 0
+    if not used.any():
+        return np.tile(np.linspace(0, 1, 256, dtype=np.float32), (3, 1))
+    curves = []
+    for channel in range(3):
+        before, after = (
+            np.round(_weigh_quantiles(values[used, channel], weights[used]), 6) for values in (colors, targets)
+        )
+        is_distinct = np.concatenate([[True], np.diff(before) > 1 / 255]) & (before > 0) & (before < 1)
+        x, y = before[is_distinct], np.maximum.accumulate(after[is_distinct].clip(0, 1))  # points of the curve
+        # at x = 1: the last point, extended in proportion
+        last_y = min(1.0, max(y[-1], y[-1] / x[-1])) if len(x) else 1.0
+        curve = np.interp(np.arange(256) / 255, [0, *x, 1], [0, *y, last_y])
+        curves.append(np.round(curve, 6).astype(np.float32))
+    return np.stack(curves)
 
 
 def map_tones(tones: np.ndarray, photo: np.ndarray) -> np.ndarray:
@@ -169,22 +184,6 @@ def _cross_fit(photos: np.ndarray, pictures: np.ndarray, weights: np.ndarray, fi
         change = fit(colors, targets, weights[:, ~fold].reshape(-1))
         out[:, fold] = change(photos[:, fold])
     return out
-
-
-def _join_quantiles(levels: np.ndarray, tones: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return the curve ``[256]`` float32 that maps quantiles of ``levels`` to those of ``tones``.
-
-    Levels and tones have ``weights [n]``. Levels below and above all quantiles are mapped in proportion.
-    """
-    used = weights > 0
-    if not used.any():
-        return np.linspace(0, 1, 256, dtype=np.float32)
-    before, after = (np.round(_weigh_quantiles(values[used], weights[used]), 6) for values in (levels, tones))
-    is_distinct = np.concatenate([[True], np.diff(before) > 1 / 255]) & (before > 0) & (before < 1)
-    x, y = before[is_distinct], np.maximum.accumulate(after[is_distinct].clip(0, 1))  # points of the curve
-    last_y = min(1.0, max(y[-1], y[-1] / x[-1])) if len(x) else 1.0  # at x = 1: the last point, extended in proportion
-    curve = np.interp(np.arange(256) / 255, [0, *x, 1], [0, *y, last_y])
-    return np.round(curve, 6).astype(np.float32)
 
 
 def _weigh_quantiles(values: np.ndarray, weights: np.ndarray) -> np.ndarray:

@@ -121,12 +121,21 @@ def read_masks(
     """Read the masks of a scene's photos; return them and notes.
 
     The masks that the camera file lists are used, or if it lists none, masks beside the scene. ``stored`` and ``cut``
-    are fields of :class:`MaskFiles`. SceneError if masks are photos.
+    are fields of :class:`MaskFiles`. SceneError if masks are photos, or outside the folder of the cameras that name
+    them.
     """
     paths = photos.paths
     views = [view for view in range(len(camera_file)) if not paths or paths[view] is not None]  # with a photo
     names = [path.as_posix() for path in paths if path is not None] or list(camera_file.names)
-    of_cameras, notes = ([], []) if "masks" in files.named else _find_masks_of_cameras(camera_file)
+    of_cameras, notes = list[Path | None](), list[str]()  # the mask of each view that the camera file names
+    if "masks" not in files.named:
+        path, listed = Path(camera_file.path), [camera_file.masks.get(image, "") for image in camera_file.names]
+        of_cameras = [find_image(path.parent, name, path, option="--masks") if name else None for name in listed]
+        missing = [name for name, mask in zip(listed, of_cameras, strict=True) if name and mask is None]
+        if missing:
+            problem = f"{len(missing)} of {len(listed)} masks that {path.name} names are not in its folder"
+            remedy = f"correct these paths, or name the masks' folder with --masks: {list_some(missing)}"
+            notes.append(Doubt(f"{problem}; {remedy}"))
     photo_masks = photo_protecting = list[Path | None]([None] * len(views))  # in the order of `names`
     if by_cameras := any(of_cameras):
         photo_masks = [of_cameras[view] for view in views]
@@ -228,19 +237,6 @@ def _describe_protected(importance: np.ndarray | None, masks: Sequence[Path | No
     share = 100 * float((importance >= (1 + max_weight) / 2).mean())
     weight = f"a weight of {max_weight:.2g}"
     return f"protect: {share:.1f} % of the photos' pixels have {weight}, by the pictures of {photos}"
-
-
-def _find_masks_of_cameras(camera_file: CameraFile) -> tuple[list[Path | None], list[str]]:
-    """Find the masks that a camera file names; return the mask of each view, and a note on masks that do not exist.
-
-    SceneError for a file outside the folder of the cameras.
-    """
-    path, names = Path(camera_file.path), [camera_file.masks.get(image, "") for image in camera_file.names]
-    masks = [find_image(path.parent, name, path, option="--masks") if name else None for name in names]
-    missing = [name for name, mask in zip(names, masks, strict=True) if name and mask is None]
-    problem = f"{len(missing)} of {len(masks)} masks that {path.name} names are not in its folder"
-    remedy = f"correct these paths, or name the masks' folder with --masks: {list_some(missing)}"
-    return masks, [Doubt(f"{problem}; {remedy}")] if missing else []
 
 
 def check_masks(masks: Masks, files: SceneFiles, pixels: Pixels | None) -> tuple[Masks, list[str]]:
