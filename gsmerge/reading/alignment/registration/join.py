@@ -55,7 +55,15 @@ def join_scenes(scenes: Sequence[Scene], paths: Sequence[Path]) -> JoinedScene:
     ]
     if len({scene.images is None for scene in moved}) > 1:
         notes.append(Doubt("some files have no photos, so none are used; name the folder of all with --images"))
-    facts = map(_describe_joined, paths, registration.similarities, registration.matches)
+    facts = []  # see JoinedScene
+    for path, similarity, matches in zip(paths, registration.similarities, registration.matches, strict=True):
+        entry: dict[str, Any] = {"path": str(path), "joined": similarity is not None}
+        if similarity is not None:
+            half_cosine = np.abs(rotmat_to_quat(similarity.rotation[None])[0, :1]).clip(0, 1)
+            degrees = round(float(np.degrees(2 * arccos(half_cosine))[0]), 4)
+            entry |= {"matches": matches, "degrees": degrees}
+            entry |= {"scale": similarity.scale, "shift": similarity.shift.tolist()}
+        facts.append(entry)
     return JoinedScene(concat_scenes(moved), tuple(used), tuple(names), tuple(notes), tuple(facts))
 
 
@@ -78,21 +86,6 @@ def _check_joinable(scenes: Sequence[Scene], paths: Sequence[Path]) -> None:
         if sh_degree != degree:
             problem = f"expected harmonics of degree {degree} as in {paths[0].name}, found {sh_degree}"
             raise SceneError(path, problem, "export all with one degree")
-
-
-def _describe_joined(path: Path, similarity: Similarity | None, matches: int) -> dict[str, Any]:
-    """Return the facts of a scene in the report, see :class:`JoinedScene`."""
-    facts: dict[str, Any] = {"path": str(path), "joined": similarity is not None}
-    if similarity is None:
-        return facts
-    half_cosine = np.abs(rotmat_to_quat(similarity.rotation[None])[0, :1]).clip(0, 1)
-    degrees = round(float(np.degrees(2 * arccos(half_cosine))[0]), 4)
-    return facts | {
-        "matches": matches,
-        "degrees": degrees,
-        "scale": similarity.scale,
-        "shift": similarity.shift.tolist(),
-    }
 
 
 def move_scene(scene: Scene, similarity: Similarity) -> Scene:
@@ -118,16 +111,18 @@ def concat_scenes(scenes: Sequence[Scene], photos: np.ndarray | None = None) -> 
     images = [scene.images for scene in scenes if scene.images is not None]
     if photos is None and len(images) == len(scenes):
         photos = np.concatenate(images)
+    rows = [(len(scene.gaussians),) for scene in scenes]
+    grids = [(len(scene), cameras.height, cameras.width) for scene in scenes]
     return Scene(
         gaussians=Gaussians.concat([scene.gaussians for scene in scenes]),
         cameras=cameras,
         images=photos,
         pixels=_concat_pixels(scenes),
         names=tuple(name for scene in scenes for name in scene.names),
-        filled=_concat_filled(scenes),
+        filled=_concat_values([scene.filled for scene in scenes], rows, usual=False),
         large_photos=_concat_large([scene.large_photos for scene in scenes]),
-        masks=None if photos is None else _concat_values(scenes, [scene.masks for scene in scenes], usual=True),
-        importance=_concat_values(scenes, [scene.importance for scene in scenes], usual=np.float32(1)),
+        masks=None if photos is None else _concat_values([scene.masks for scene in scenes], grids, usual=True),
+        importance=_concat_values([scene.importance for scene in scenes], grids, usual=np.float32(1)),
         region=scenes[0].region,
     )
 
@@ -145,25 +140,14 @@ def _concat_pixels(scenes: Sequence[Scene]) -> Pixels | None:
     return Pixels(np.concatenate(homes), np.concatenate(fronts), own=True)
 
 
-def _concat_filled(scenes: Sequence[Scene]) -> np.ndarray | None:
-    """Concatenate the masks ``[n]`` of Gaussians that fill holes; None if no Gaussian fills a hole."""
-    if all(scene.filled is None for scene in scenes):
-        return None
-    masks = [np.zeros(len(scene.gaussians), bool) if scene.filled is None else scene.filled for scene in scenes]
-    return np.concatenate(masks)
-
-
 def _concat_values(
-    scenes: Sequence[Scene], values: Sequence[np.ndarray | None], *, usual: bool | np.float32
+    values: Sequence[np.ndarray | None], shapes: Sequence[tuple[int, ...]], *, usual: bool | np.float32
 ) -> np.ndarray | None:
-    """Concatenate values ``[v,h,w]`` of pixels; a scene without values gets ``usual``. None if no scene has values."""
+    """Concatenate values of scenes; a scene without values gets ``usual`` in its shape. None if no scene has values."""
     if all(scene_values is None for scene_values in values):
         return None
-    arrays = []
-    for scene, scene_values in zip(scenes, values, strict=True):
-        shape = len(scene), scene.cameras.height, scene.cameras.width
-        arrays.append(np.full(shape, usual) if scene_values is None else scene_values)
-    return np.concatenate(arrays)
+    pairs = zip(values, shapes, strict=True)
+    return np.concatenate([np.full(shape, usual) if array is None else array for array, shape in pairs])
 
 
 def _concat_large(photos: Sequence[LargePhotos | None]) -> LargePhotos | None:

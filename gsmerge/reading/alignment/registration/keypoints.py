@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import cv2
@@ -71,7 +70,7 @@ def find_keypoints(scene: Scene) -> list[PhotoKeypoints]:
         picture_pixels, descriptors = _detect_keypoints(picture, picture_K[1, 1] / picture_K[0, 0])
         focal_ratios = K[0, 0] / picture_K[0, 0], K[1, 1] / picture_K[1, 1]
         pixels = (picture_pixels - picture_K[:2, 2]) * focal_ratios + K[:2, 2]
-        z, is_surface = _depths_at(_surface_depths(scene, view, viewmat), pixels)
+        z, is_surface = _depths_at(scene, view, viewmat, pixels)
         rays = matmul(np.concatenate([pixels, np.ones((len(pixels), 1))], 1), invert(K).T)
         points = matmul(rays[is_surface] * z[is_surface, None] - viewmat[:3, 3], viewmat[:3, :3])
         photos.append(PhotoKeypoints(pixels[is_surface], points, descriptors[is_surface], viewmat, K))
@@ -110,35 +109,26 @@ def _detect_keypoints(picture: np.ndarray, stretch: float) -> tuple[np.ndarray, 
     max_keypoints = 4000  # most keypoints of a photo
     contrast = 0.02  # least contrast of a keypoint; OpenCV's default finds too few on plain walls
     finder = cv2.SIFT.create(max_keypoints, contrastThreshold=contrast)
-    with _equal_on_any_processor():
+    # OpenCV uses only instructions of all processors, so that keypoints are equal on all
+    before = cv2.useOptimized()
+    cv2.setUseOptimized(False)
+    try:
         square = cv2.resize(grey, (wide, high), interpolation=cv2.INTER_LINEAR)
         keypoints, descriptors = finder.detectAndCompute(square, None)
+    finally:
+        cv2.setUseOptimized(before)
     if descriptors is None:
         return np.empty((0, 2)), np.empty((0, 128), np.float32)
     places = np.array([keypoint.pt for keypoint in keypoints], np.float64) + 0.5
     return places * (width / wide, height / high), descriptors
 
 
-@contextmanager
-def _equal_on_any_processor() -> Iterator[None]:
-    """Within the block, let OpenCV use only instructions of all processors, so that keypoints are equal on all."""
-    before = cv2.useOptimized()
-    cv2.setUseOptimized(False)
-    try:
-        yield
-    finally:
-        cv2.setUseOptimized(before)
-
-
-def _surface_depths(scene: Scene, view: int, viewmat: np.ndarray) -> np.ndarray:
-    """Return the depth ``[h,w]`` of the front Gaussian of each pixel of a view; infinite without a Gaussian."""
+def _depths_at(scene: Scene, view: int, viewmat: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the median depth ``[n]`` of 3 x 3 pixels around ``pixels [n,2]``, and whether these show one surface."""
+    # the depth of the front Gaussian of each pixel of the view; infinite without a Gaussian
     rows = scene.get_pixels().fronts[view]
     depths = camera_depths(scene.gaussians.means[rows].astype(np.float64), viewmat)
-    return np.asarray(np.where((rows >= 0) & (depths > 0), depths, np.inf))
-
-
-def _depths_at(depths: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the median depth ``[n]`` of 3 x 3 pixels around ``pixels [n,2]``, and whether these show one surface."""
+    depths = np.where((rows >= 0) & (depths > 0), depths, np.inf)
     padded = np.pad(depths, 1, mode="edge")
     height, width = depths.shape
     x = np.floor(pixels[:, 0]).astype(int).clip(0, width - 1)
@@ -155,9 +145,24 @@ def match_photos(
     other_photos: Sequence[PhotoKeypoints],
     size: tuple[int, int],
 ) -> KeypointMatches:
-    """Match the keypoints of all photos of two scenes; ``size`` is width and height of their grids, pixels."""
+    """Match the keypoints of all photos of two scenes; ``size`` is width and height of their grids, pixels.
+
+    Two keypoints match if the descriptor of each is the best match of the other, and clearly better than the
+    second-best match.
+    """
     pairs = [(a, b) for a in photos for b in other_photos]
-    rows = [_match_descriptors(a.descriptors, b.descriptors) for a, b in pairs]
+    rows = []  # of each pair of photos: the keypoints of the first that have a match, and their matches in the second
+    for a, b in ((a.descriptors, b.descriptors) for a, b in pairs):
+        if min(len(a), len(b)) < 2:  # without a second-best match nothing can be decided
+            rows.append((np.empty(0, int), np.empty(0, int)))
+            continue
+        # all sums are whole numbers below 2^24, so float32 is exact in any order of summation
+        distances = (a * a).sum(1)[:, None] + (b * b).sum(1) - 2 * (a @ b.T)
+        best = distances.argmin(1)
+        two_best = np.partition(distances, 1, axis=1)[:, :2].astype(np.float64)
+        is_clear = two_best[:, 0] < MATCH_RATIO**2 * two_best[:, 1]
+        matched = is_clear & (distances.argmin(0)[best] == np.arange(len(a)))
+        rows.append((np.flatnonzero(matched), best[matched]))
     first = _make_side([a for a, _ in pairs], [ids for ids, _ in rows])
     second = _make_side([b for _, b in pairs], [ids for _, ids in rows])
     diagonal = float(np.sqrt(size[0] ** 2 + size[1] ** 2))
@@ -175,19 +180,3 @@ def _make_side(photos: Sequence[PhotoKeypoints], rows: Sequence[np.ndarray]) -> 
         viewmats=np.repeat([photo.viewmat for photo in photos], counts, 0),
         Ks=np.repeat([photo.K for photo in photos], counts, 0),
     )
-
-
-def _match_descriptors(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Match descriptors ``a`` and ``b``; return the rows of ``a`` that have a match, and the matching rows of ``b``.
-
-    Two descriptors match if each is the best match of the other, and clearly better than the second-best match.
-    """
-    if min(len(a), len(b)) < 2:  # without a second-best match nothing can be decided
-        return np.empty(0, int), np.empty(0, int)
-    # all sums are whole numbers below 2^24, so float32 is exact in any order of summation
-    distances = (a * a).sum(1)[:, None] + (b * b).sum(1) - 2 * (a @ b.T)
-    best = distances.argmin(1)
-    two_best = np.partition(distances, 1, axis=1)[:, :2].astype(np.float64)
-    is_clear = two_best[:, 0] < MATCH_RATIO**2 * two_best[:, 1]
-    matched = is_clear & (distances.argmin(0)[best] == np.arange(len(a)))
-    return np.flatnonzero(matched), best[matched]

@@ -24,22 +24,13 @@ from gsmerge.geometry.transforms import (
     descend,
     lower_median,
     motion_matrices,
+    normalize,
+    quat_to_rotmat,
+    rotmat_to_quat,
 )
 from gsmerge.kernels.elementary import exp, log, log1p
-from gsmerge.kernels.matrices import matmul, solve, transform
-from gsmerge.reading.alignment.registration.keypoints import (
-    KeypointMatches,
-    MatchSide,
-    PhotoKeypoints,
-    find_keypoints,
-    match_photos,
-)
-from gsmerge.reading.alignment.registration.similarities import (
-    compose,
-    fit_similarities,
-    invert_similarity,
-    round_similarity,
-)
+from gsmerge.kernels.matrices import eigh, matmul, solve, transform
+from gsmerge.reading.alignment.registration.keypoints import KeypointMatches, MatchSide, find_keypoints, match_photos
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Scene
 
@@ -52,6 +43,7 @@ LOOSE = (100.0, 10.0, 2.0, 2.0)
 MIN_MATCHES = 16  # least number of agreeing matches of two connected scenes; unrelated photos have up to 5
 SIMILARITY_DAMPING = Damping(steps=40, first=1e-4, decrease=0.1, increase=10.0, largest=1e6, min_gain=1e-9)
 NUM_PARAMETERS = 7  # parameters of a step: rotation, shift, logarithm of the scale
+DIGITS = 7  # decimals to which a similarity is rounded; further digits have no meaning
 
 Similarities = Sequence[Similarity | None]
 # Similarities, and the cost of their residuals with the cost's curvature and slope; see _normal_equations
@@ -89,9 +81,69 @@ def register(scenes: Sequence[Scene]) -> Registration:
         connected, spread = _measure_spreads(similarities, connected)
     agreeing = [pair.select(_squared_residuals(similarities, pair, spread) < AGREE) for pair in connected]
     matches = [sum(len(pair) for pair in agreeing if i in pair.scenes) for i in range(count)]
-    unit = _choose_shift_unit(photos, similarities)
+    # Shifts are rounded in a power of two above the first placed scene's median depth. If it has no keypoints, in 1
+    first = next(scene_photos for scene_photos, each in zip(photos, similarities, strict=True) if each is not None)
+    depths = np.concatenate([camera_depths(photo.points, photo.viewmat) for photo in first])
+    unit = float(2.0 ** np.frexp(lower_median(depths))[1]) if len(depths) else 1.0
     rounded = tuple(None if similarity is None else round_similarity(similarity, unit) for similarity in similarities)
     return Registration(rounded, tuple(matches))
+
+
+# Similarities
+
+
+def fit_similarities(p: np.ndarray, q: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Fit ``q = scale * rotation @ p + shift`` to b sets of points ``[b,n,3]`` with weights ``[b,n]``.
+
+    Rotations are solved as by Horn (1987). The scale is the ratio of the spreads of ``q`` and ``p``, since both have
+    errors. Returns rotations ``[b,3,3]``, scales ``[b]`` and shifts ``[b,3]``.
+    """
+    share = (weights / weights.sum(1, keepdims=True))[..., None]
+    middle_p = (share * p).sum(1)
+    middle_q = (share * q).sum(1)
+    a = p - middle_p[:, None]
+    b = q - middle_q[:, None]
+    scales = np.sqrt(_spread(b, share) / _spread(a, share))
+    m = matmul((share * b).swapaxes(1, 2), a)  # covariance of the two sets
+    trace = np.trace(m, axis1=1, axis2=2)
+    axis = np.stack([m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]], 1)
+    # the quaternion is the eigenvector of the largest eigenvalue of the quadratic form ``form``
+    form = np.empty((len(m), 4, 4))
+    form[:, 0, 0] = trace
+    form[:, 0, 1:] = axis
+    form[:, 1:, 0] = axis
+    form[:, 1:, 1:] = m + m.swapaxes(1, 2) - trace[:, None, None] * np.eye(3)
+    rotations = quat_to_rotmat(eigh(form)[1][:, :, -1])
+    shifts = middle_q - scales[:, None] * transform(rotations, middle_p)
+    return rotations, scales, shifts
+
+
+def _spread(points: np.ndarray, share: np.ndarray) -> np.ndarray:
+    """Return the weighted mean square ``[b]``, above 0, of b sets of centred points ``[b,n,3]``."""
+    return np.asarray(np.maximum((share * points**2).sum((1, 2)), 1e-30))
+
+
+def compose(second: Similarity, first: Similarity) -> Similarity:
+    """Compose two similarities: apply ``first``, then ``second``."""
+    rotation = matmul(second.rotation, first.rotation)
+    shift = second.move_points(first.shift)
+    return Similarity(rotation, second.scale * first.scale, shift)
+
+
+def invert_similarity(similarity: Similarity) -> Similarity:
+    """Return the inverse of a similarity."""
+    shift = -matmul(similarity.rotation.T, similarity.shift) / similarity.scale
+    return Similarity(similarity.rotation.T, 1 / similarity.scale, shift)
+
+
+def round_similarity(similarity: Similarity, unit: float) -> Similarity:
+    """Return a rounded similarity, so that tiny differences between keypoints do not change results.
+
+    ``unit`` is the unit in which the shift is rounded.
+    """
+    quat = normalize(rotmat_to_quat(similarity.rotation[None]).round(DIGITS))
+    shift = unit * (similarity.shift / unit).round(DIGITS)
+    return Similarity(quat_to_rotmat(quat)[0], round(similarity.scale, DIGITS), shift)
 
 
 # Two scenes
@@ -104,8 +156,23 @@ def connect(matches: KeypointMatches) -> tuple[Similarity, KeypointMatches] | No
     """
     if len(matches) < MIN_MATCHES:
         return None
+    # similarities are fitted to random triples of matches
+    rng = np.random.default_rng(0)
+    p, q = (side.points for side in matches.sides)
+    first_depths, second_depths = (camera_depths(side.points, side.viewmats) for side in matches.sides)
+    num_triples = 2000  # number of random triples
+    rows = rng.integers(0, len(matches), (num_triples, 3))
+    weights = (1 / (first_depths * second_depths))[rows]
+    rotations, scales, shifts = fit_similarities(p[rows], q[rows], weights)
+    moved = scales[:, None, None] * matmul(p, rotations.swapaxes(1, 2)) + shifts[:, None]
+    distances = ((moved - q) ** 2).sum(2) / np.minimum(second_depths, scales[:, None] * first_depths) ** 2
+    max_distance = 0.25  # distance of matched points, divided by their depth, up to which a match supports a triple
+    closeness = (1 - distances / max_distance**2).clip(0).sum(1)
+    # of the similarities that agree with most matches, the best by residuals is taken
+    num_trials = 60
+    ids = np.argsort(-closeness, kind="stable")[:num_trials]
+    trials = [Similarity(rotations[i], float(scales[i]), shifts[i]) for i in ids]
     pair = replace(matches, scenes=(0, 1))
-    trials = _sample_similarities(matches)
     squares = [_squared_residuals((trial, IDENTITY), pair, DEPTH_SPREAD) for trial in trials]
     best = int(np.argmax([(1 - trial_squares / AGREE).clip(0).sum() for trial_squares in squares]))
     similarities: Similarities = (trials[best], IDENTITY)
@@ -121,24 +188,6 @@ def connect(matches: KeypointMatches) -> tuple[Similarity, KeypointMatches] | No
     if similarity is None or agree.sum() < max(MIN_MATCHES, min_share * len(matches)):
         return None
     return similarity, matches.select(agree)
-
-
-def _sample_similarities(matches: KeypointMatches) -> list[Similarity]:
-    """Fit similarities to random triples of matches; return the similarities that agree with most matches."""
-    rng = np.random.default_rng(0)
-    p, q = (side.points for side in matches.sides)
-    first_depths, second_depths = (camera_depths(side.points, side.viewmats) for side in matches.sides)
-    num_triples = 2000  # number of random triples
-    rows = rng.integers(0, len(matches), (num_triples, 3))
-    weights = (1 / (first_depths * second_depths))[rows]
-    rotations, scales, shifts = fit_similarities(p[rows], q[rows], weights)
-    moved = scales[:, None, None] * matmul(p, rotations.swapaxes(1, 2)) + shifts[:, None]
-    squares = ((moved - q) ** 2).sum(2) / np.minimum(second_depths, scales[:, None] * first_depths) ** 2
-    max_distance = 0.25  # distance of matched points, divided by their depth, up to which a match supports a triple
-    closeness = (1 - squares / max_distance**2).clip(0).sum(1)
-    num_trials = 60  # similarities that are returned, the best first
-    best = np.argsort(-closeness, kind="stable")[:num_trials]
-    return [Similarity(rotations[i], float(scales[i]), shifts[i]) for i in best]
 
 
 def _similarity_between(similarities: Similarities, scenes: Sequence[int]) -> Similarity:
@@ -251,11 +300,9 @@ def _chain_largest_set(links: Sequence[tuple[Similarity, KeypointMatches]], coun
     for _, pair in links:
         for scene in pair.scenes:
             num_matches[scene] += len(pair)
-    best: Similarities = []
-    for start in sorted(range(count), key=lambda scene: -num_matches[scene]):
-        similarities = _chain_from_scene(start, links, count)
-        if _count_placed(similarities) > _count_placed(best):
-            best = similarities
+    starts = sorted(range(count), key=lambda scene: -num_matches[scene])
+    chains = [_chain_from_scene(start, links, count) for start in starts]
+    best = max(chains, key=lambda similarities: sum(similarity is not None for similarity in similarities))
     first = next(similarity for similarity in best if similarity is not None)
     to_first = invert_similarity(first)
 
@@ -266,11 +313,6 @@ def _chain_largest_set(links: Sequence[tuple[Similarity, KeypointMatches]], coun
         return IDENTITY if similarity is first else compose(to_first, similarity)
 
     return list(map(move, best))
-
-
-def _count_placed(similarities: Similarities) -> int:
-    """Count the scenes that are placed."""
-    return sum(similarity is not None for similarity in similarities)
 
 
 def _chain_from_scene(start: int, links: Sequence[tuple[Similarity, KeypointMatches]], count: int) -> Similarities:
@@ -321,18 +363,13 @@ def _refine_similarities(
         if not np.isfinite(steps).all():
             return None
         moved = list(current)
-        for i, vector in zip(free, steps, strict=True):
-            moved[i] = compose(current[i] or IDENTITY, _make_similarity(vector))
+        for i, vector in zip(free, steps, strict=True):  # rotation vector, shift and logarithm of the scale
+            rotation = motion_matrices(np.concatenate([vector[:3], np.zeros(3)])[None])[0, :3, :3]
+            scale = float(exp(vector[6:].clip(-1, 1))[0])
+            moved[i] = compose(current[i] or IDENTITY, Similarity(rotation, scale, vector[3:6]))
         return linearise(moved)
 
     return descend(linearise(similarities), lambda fit: fit[1][0], step, SIMILARITY_DAMPING)[0]  # [1][0]: the cost
-
-
-def _make_similarity(step: np.ndarray) -> Similarity:
-    """Make the similarity of a step ``[7]``: rotation vector, shift and logarithm of the scale."""
-    rotation = motion_matrices(np.concatenate([step[:3], np.zeros(3)])[None])[0, :3, :3]
-    scale = float(exp(step[6:].clip(-1, 1))[0])
-    return Similarity(rotation, scale, step[3:6])
 
 
 def _normal_equations(
@@ -383,13 +420,3 @@ def _differentiate_by_step(slopes: np.ndarray, points: np.ndarray, similarity: S
     by_rotation = np.stack([zero, z, -y, -z, zero, x, y, -x, zero], 1).reshape(-1, 3, 3)
     by_scale = matmul(by_point, points[..., None])
     return np.concatenate([matmul(by_point, by_rotation), by_point, by_scale], 2)
-
-
-def _choose_shift_unit(photos: Sequence[Sequence[PhotoKeypoints]], similarities: Similarities) -> float:
-    """Return the unit in which shifts are rounded, the power of two above the first placed scene's median depth.
-
-    If the first placed scene has no keypoints, the unit is 1.
-    """
-    first = next(scene_photos for scene_photos, each in zip(photos, similarities, strict=True) if each is not None)
-    depths = np.concatenate([camera_depths(photo.points, photo.viewmat) for photo in first])
-    return float(2.0 ** np.frexp(lower_median(depths))[1]) if len(depths) else 1.0

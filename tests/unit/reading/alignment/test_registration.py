@@ -19,8 +19,7 @@ from gsmerge.geometry.transforms import Similarity, camera_centres
 from gsmerge.geometry.views import subset
 from gsmerge.reading.alignment.registration import keypoints
 from gsmerge.reading.alignment.registration.join import join_scenes, move_scene
-from gsmerge.reading.alignment.registration.register import register
-from gsmerge.reading.alignment.registration.similarities import DIGITS, fit_similarities
+from gsmerge.reading.alignment.registration.register import DIGITS, fit_similarities, register
 from gsmerge.research.generate import GenerateOptions, NoiseOptions, make_synthetic_scene
 from gsmerge.types import NO_CAMERAS, Pixels
 
