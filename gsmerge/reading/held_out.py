@@ -52,7 +52,12 @@ def read_held_out(load: Loaded, cameras: StrPath, images: StrPath | None = None)
         problem = "expected held-out views, found only views that the scene was made from"
         raise SceneError(path, problem, "name a camera file that has other views of the scene")
     held_out = select_views(camera_file, places)
-    files = SceneFiles(load.files.ply, path, _find_photo_folder(path, held_out, images), photo_option=_OPTION)
+    if images is not None and not Path(images).is_dir():
+        actual = "a file" if Path(images).exists() else "no such folder"
+        raise SceneError(images, f"expected a folder of photos, found {actual}", f"name it with {_OPTION}")
+    # the camera file may have photos inside; otherwise photos that are not named are searched
+    inside = path if len(held_out.images) else None
+    files = SceneFiles(load.files.ply, path, inside if images is None else Path(images), photo_option=_OPTION)
     photos = stored_photos(files, held_out)
     if not len(photos):
         root = path if path.is_dir() else path.parent
@@ -90,41 +95,20 @@ def read_into_frame(load: Loaded, path: Path) -> tuple[CameraFile, dict[int, int
     return replace(camera_file, viewmats=world.move_viewmats(camera_file.viewmats)), shared
 
 
-def _find_photo_folder(path: Path, cameras: CameraFile, images: StrPath | None) -> Path | None:
-    """Return the folder ``images``, or the camera file if it has photos inside; None if photos have to be searched.
+def _find_world(camera_file: CameraFile, load: Loaded) -> tuple[Similarity, dict[int, int]]:
+    """Find the similarity from the file's world to the world of the Gaussians, and the views that the scene also has.
 
-    Raises SceneError if ``images`` is no folder.
+    The second result maps views of the file to views of the scene with the same name, by index; folders and endings of
+    names are ignored. The map is empty if names are not unique, or if no similarity brings the two poses of all shared
+    views together.
     """
-    if images is not None:
-        if not Path(images).is_dir():
-            actual = "a file" if Path(images).exists() else "no such folder"
-            raise SceneError(images, f"expected a folder of photos, found {actual}", f"name it with {_OPTION}")
-        return Path(images)
-    return path if len(cameras.images) else None
-
-
-def _match_by_name(camera_file: CameraFile, names: tuple[str, ...]) -> dict[int, int]:
-    """Map views of a file to views of the scene with the same name, by index; {} if names are not unique.
-
-    Folders and endings of names are ignored.
-    """
+    stored, names = _find_similarity(load), load.scene.names
     file_views, scene_views = (
         {PurePosixPath(name.replace("\\", "/")).stem: i for i, name in enumerate(view_names)}
         for view_names in (camera_file.names, names)
     )
-    if len(file_views) < len(camera_file) or len(scene_views) < len(names):
-        return {}
-    return {file_views[stem]: view for stem, view in scene_views.items() if stem in file_views}
-
-
-def _find_world(camera_file: CameraFile, load: Loaded) -> tuple[Similarity, dict[int, int]]:
-    """Find the similarity from the file's world to the world of the Gaussians, and the views that the scene also has.
-
-    The second result maps views of the file to views of the scene with the same name, by index. The map is empty if no
-    similarity brings the two poses of all shared views together.
-    """
-    stored, shared = _find_similarity(load), _match_by_name(camera_file, load.scene.names)
-    if not shared:
+    shared = {file_views[stem]: view for stem, view in scene_views.items() if stem in file_views}
+    if not shared or len(file_views) < len(camera_file) or len(scene_views) < len(names):
         return stored, {}
     theirs = camera_file.viewmats[list(shared)]
     ours = load.scene.cameras.viewmats[list(shared.values())]

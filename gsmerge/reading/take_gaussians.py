@@ -11,10 +11,13 @@ from gsmerge.errors import Note, split_notes
 from gsmerge.geometry.transforms import camera_depths, rgb_to_sh0, sh0_to_rgb
 from gsmerge.io.formats.color_units import RGB_NOTE
 from gsmerge.io.formats.read_gaussians import GaussianFile
-from gsmerge.raster.photos import LEAST_OPACITY
+from gsmerge.raster.photos import LEAST_OPACITY, shrink_pictures
 from gsmerge.reading.alignment import AlignmentResult
 from gsmerge.reading.loaded import Loaded
-from gsmerge.reading.photos.scene_photos import has_nearer_colors
+from gsmerge.reading.photos.colors import cut_blocks
+from gsmerge.reading.photos.offsets import OFFSET_PIXELS
+from gsmerge.reading.photos.similarity import stands_out
+from gsmerge.reading.photos.view_pictures import Pairs, show_views
 from gsmerge.types import Gaussians, Pixels
 
 _BLOCK = 1 << 20  # numbers that are compared at once
@@ -67,14 +70,19 @@ def _counts_up(ids: np.ndarray) -> bool:
 
 def confirm_colors(load: Loaded) -> Loaded:
     """Read colours as RGB instead of harmonics, or vice versa, if the file allows both and the photos fit better."""
-    old_info, units = load.info, load.info.open_units
-    if units is None or load.scene.images is None:
+    old_info, units, images = load.info, load.info.open_units, load.scene.images
+    if units is None or images is None:
         return load
     was_rgb = old_info.color_units is not None  # the colours were read as RGB, and harmonics are tried here
     sh0 = load.scene.gaussians.sh0
     sh0 = units.black + (units.white - units.black) * sh0_to_rgb(sh0) if was_rgb else rgb_to_sh0(units.rgb(sh0))
     other = replace(load.scene, gaussians=replace(load.scene.gaussians, sh0=sh0.astype(np.float32)))
-    if not has_nearer_colors(other, load.scene):
+    errors = []  # of blocks of both scenes' pictures, against the same blocks of the photos
+    for scene in (load.scene, other):
+        shown = show_views(scene, OFFSET_PIXELS)
+        photos = shrink_pictures(images, *shown.weights.shape[2:0:-1])
+        errors.append(cut_blocks(Pairs(photos, shown)).errors())
+    if not stands_out(errors[0] - errors[1]):
         return load
     new_note = "" if was_rgb else RGB_NOTE.format(units.name, "photos show it")
     notes = *([Note(new_note, "colors")] if new_note else []), *split_notes(load.notes, "colors")[1]

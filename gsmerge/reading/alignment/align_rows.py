@@ -75,7 +75,7 @@ class RowSource:
         images = NO_IMAGES
         if photos:
             images = self.images if grid.transform is None else as_floats(grid.transform.photos(self.photos))
-        return AlignmentInput(self.ply.gaussians, self.ply.valid, grid.cameras, images, self.order, self.scale)
+        return AlignmentInput(self.ply.gaussians, self.ply.valid, grid.cameras, images, self.scale)
 
 
 @dataclass(frozen=True)
@@ -283,7 +283,8 @@ def _align_without_pixels(source: RowSource, grid: Grid, frames: Callable[[], Se
     Raises SceneError if no cameras see the rows, or if the rows turn out to be pixels of other cameras.
     """
     inputs = source.inputs(grid)
-    refuse_other_cameras(inputs, source.camera_file)
+    if source.order != "none":
+        refuse_other_cameras(inputs, source.camera_file)
     if source.scale is not None:
         grid = replace(grid, cameras=scale_by(source.scale).move_cameras(grid.cameras))
     # the error of rows that are not the pixels of the cameras states both numbers

@@ -35,14 +35,6 @@ _FREE_INTRINSICS = (ONE_FOCAL, TWO_FOCALS, ALL_INTRINSICS)
 _FAR, _FAR_PX = 3.0, 1.0
 
 
-@dataclass(frozen=True)
-class Calibration:
-    """Cameras of v views, and the distance of points from their pixels in the worst view."""
-
-    cameras: Cameras
-    worst_px: float  # largest median distance of a view's points from their pixels, pixels
-
-
 @dataclass(frozen=True, eq=False)
 class _Model:
     """Cameras of v views, solved for with ``free`` free intrinsics, and the errors of these cameras."""
@@ -67,7 +59,7 @@ class _Model:
         return count * float(log((errors * errors).mean())) + self.free * float(log(count))
 
 
-def calibrate(pairs: Correspondences, width: int, height: int) -> Calibration | None:
+def calibrate(pairs: Correspondences, width: int, height: int) -> Cameras | None:
     """Calibrate the cameras of views of ``width`` x ``height`` pixels from ``pairs`` of Gaussians and pixels.
 
     A view without pairs gets the camera of the view before it. Returns None if the points do not determine the cameras,
@@ -98,7 +90,7 @@ def calibrate(pairs: Correspondences, width: int, height: int) -> Calibration | 
     viewmats[:, :3, 3] = unit * viewmats[:, :3, 3] - matmul(viewmats[:, :3, :3], middle)
     all_views = np.arange(int(view_ids[-1]) + 1)
     solved = np.maximum(np.searchsorted(view_ids, all_views, side="right") - 1, 0)  # index of the solved camera
-    return Calibration(Cameras(viewmats[solved], model.Ks[solved], width, height), model.worst_px)
+    return Cameras(viewmats[solved], model.Ks[solved], width, height)
 
 
 def _solve_models(

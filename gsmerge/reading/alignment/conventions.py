@@ -173,25 +173,6 @@ def _measure_disagreement(points: np.ndarray, pairs: Correspondences, images: np
     return float(np.median(values)) if len(values) else np.inf
 
 
-def fit_lines(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Fit ``y = slope * x + offset`` to each column of ``x [n,d]`` and ``y [n,d]`` by reweighted least squares.
-
-    Returns slopes ``[d]``, offsets ``[d]`` and the distances ``[n]`` of the points from the lines.
-    """
-    x, y = (np.ascontiguousarray(values.T) for values in (x, y))
-    weights = np.ones(x.shape[1])
-    with np.errstate(all="ignore"):
-        line_rounds = 4  # number of rounds of reweighted least squares
-        for _ in range(line_rounds):
-            mean_x, mean_y = ((weights * values).sum(1, keepdims=True) / weights.sum() for values in (x, y))
-            dx, dy = x - mean_x, y - mean_y
-            slopes = (weights * dx * dy).sum(1, keepdims=True) / (weights * dx**2).sum(1, keepdims=True)
-            offsets = mean_y - slopes * mean_x
-            errors = np.sqrt(((y - slopes * x - offsets) ** 2).sum(0))
-            weights = robust_weights(errors, 3, 1e-9)
-    return slopes[:, 0], offsets[:, 0], errors
-
-
 def _fit_intrinsics(pairs: Correspondences, cameras: Cameras, moved_px: float) -> Cameras | None:
     """Scale and shift the intrinsics of all views by the same factors and shifts; None if moved poses fit better.
 
@@ -203,9 +184,19 @@ def _fit_intrinsics(pairs: Correspondences, cameras: Cameras, moved_px: float) -
         xy, depth = project_points(pairs.points[:, None], cameras.viewmats[pairs.views], cameras.Ks[pairs.views])
     in_front = (depth[:, 0] > 0) & np.isfinite(xy[:, 0]).all(1)
     projected, pixels = xy[in_front, 0], pairs.pixels[in_front]
-    # x and y have separate fits, because a point may fit in x but not in y
-    slopes_and_offsets = [fit_lines(projected[:, [axis]], pixels[:, [axis]])[:2] for axis in range(2)]
-    factors, shifts = np.array(slopes_and_offsets)[:, :, 0].T
+    # x and y have separate fits of lines, because a point may fit in x but not in y
+    factors, shifts = np.empty(2), np.empty(2)
+    line_rounds = 4  # number of rounds of reweighted least squares
+    for axis in range(2):
+        x, y = (np.ascontiguousarray(values[:, axis]) for values in (projected, pixels))
+        weights = np.ones(len(x))
+        with np.errstate(all="ignore"):
+            for _ in range(line_rounds):
+                mean_x, mean_y = ((weights * values).sum() / weights.sum() for values in (x, y))
+                dx, dy = x - mean_x, y - mean_y
+                factors[axis] = (weights * dx * dy).sum() / (weights * dx**2).sum()
+                shifts[axis] = mean_y - factors[axis] * mean_x
+                weights = robust_weights(np.abs(y - factors[axis] * x - shifts[axis]), 3, 1e-9)
     Ks = cameras.Ks * np.array([*factors, 1])[:, None]
     Ks[:, :2, 2] += shifts
     refitted = replace(cameras, Ks=Ks)

@@ -18,10 +18,11 @@ from gsmerge.geometry.transforms import median
 from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, StoredView, make_camera_file
 from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.reproject import follow_pixels
-from gsmerge.reading.alignment.calibration import Calibration, calibrate
+from gsmerge.reading.alignment.calibration import calibrate
 from gsmerge.reading.alignment.layouts import ESTIMATED, Layout
 from gsmerge.reading.alignment.resection import projective_camera
 from gsmerge.reading.alignment.score import find_correspondences, is_as_near
+from gsmerge.types import Cameras
 
 _MIN_SIDE, _MAX_WIDTH = 16, 2048  # fewest and most pixels of a line
 # A length of lines is tried if at least the share _MIN_SHARE of the sampled rows shows it. At most _MAX_LENGTHS lengths
@@ -63,10 +64,9 @@ def estimate_cameras(path: Path, means: np.ndarray, valid: np.ndarray) -> Camera
     for order, (points, used) in product(orders, point_sets):
         grid = find_dropped_grid(points[order], used[order])
         if grid is not None:
-            layout, calibration = grid
+            layout, cameras = grid
             pixel_ids = np.empty(len(rows), np.int64)
             pixel_ids[order] = np.where(valid[order], layout.pixel_ids(), -1)
-            cameras = calibration.cameras
             views = [
                 StoredView(f"view {view}", pose, K, (cameras.width, cameras.height))
                 for view, (pose, K) in enumerate(zip(cameras.viewmats[:, :3], cameras.Ks, strict=True))
@@ -75,7 +75,7 @@ def estimate_cameras(path: Path, means: np.ndarray, valid: np.ndarray) -> Camera
     return None
 
 
-def find_dropped_grid(means: np.ndarray, valid: np.ndarray) -> tuple[Layout, Calibration] | None:
+def find_dropped_grid(means: np.ndarray, valid: np.ndarray) -> tuple[Layout, Cameras] | None:
     """Find the pixels of rows ``means [n,3]`` and the cameras of their views, if some pixels have no row.
 
     ``valid [n]`` bool marks the finite rows. Lines and columns at the borders without rows are not part of the grid.
@@ -98,9 +98,9 @@ def find_dropped_grid(means: np.ndarray, valid: np.ndarray) -> tuple[Layout, Cal
             # the numbers of a view's rows count only finite rows
             ids[rows[view.rows]] = number * height * width + ((view.y + top) * width + view.x + left)
         layout = Layout(len(views), width, height, ids=ids)
-        calibration = calibrate(find_correspondences(means, valid, layout, _SOLVED_FROM), width, height)
-        if calibration is not None:
-            return layout, calibration
+        cameras = calibrate(find_correspondences(means, valid, layout, _SOLVED_FROM), width, height)
+        if cameras is not None:
+            return layout, cameras
     return None
 
 

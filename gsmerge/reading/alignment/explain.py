@@ -18,7 +18,7 @@ def refuse_other_cameras(inputs: AlignmentInput, camera_file: CameraFile) -> Non
     If the photos have the colours of the rows, no error is raised, because the views may just be in another order.
     """
     cameras = inputs.cameras
-    if inputs.order == "none" or len(inputs.gaussians) != len(cameras) * cameras.width * cameras.height:
+    if len(inputs.gaussians) != len(cameras) * cameras.width * cameras.height:
         return  # the rows cannot be all pixels in order
     pairs = sample_pixels(inputs.gaussians, cameras, inputs.valid)
     alignment, first_view = check_pairs(pairs, cameras), pairs.select(pairs.views == 0)

@@ -50,13 +50,12 @@ def pixel_errors(pairs: Correspondences, cameras: Cameras) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class AlignmentInput:
-    """Input of the search for pixels: rows, cameras, photos and hints."""
+    """Input of the search for pixels: rows, cameras, photos and a hint."""
 
     gaussians: Gaussians  # the file's n rows
     valid: np.ndarray  # ``[n]`` bool
     cameras: Cameras  # all c cameras at the grid's size, in their own world
     images: np.ndarray  # ``[c,h,w,3]`` photos; [0,...] without any
-    order: str = "auto"  # the order of the rows if it is given, otherwise "auto"
     scale: float | None = None  # length of one unit of the cameras' world in the Gaussians' world, if given
 
     def pairs(self, layout: Layout, per_view: int = 0) -> Correspondences:

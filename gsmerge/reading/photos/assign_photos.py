@@ -69,16 +69,6 @@ class _Scores:
         """Return the score ``[v,p]`` of each photo in each view, in the best orientation."""
         return np.nan_to_num(self.values, nan=-np.inf).max(2)
 
-    def choose_orientation(self, view: int, photo: int, tag: int) -> int:
-        """Choose the orientation in which a photo shows a view.
-
-        The stored orientation, 0, is tried first, and ``tag`` next. Each is chosen if no other orientation scores
-        clearly higher. If neither is chosen, the result is the orientation with the highest score.
-        """
-        scores = np.nan_to_num(self.values[view, self.photos.index(photo)], nan=-np.inf)
-        proposed = (orientation for orientation in (0, tag) if scores[orientation] > scores.max() - SIGNIFICANT)
-        return next(proposed, int(scores.argmax()))
-
 
 class Assigner:
     """Assign photos to the views of a scene, and cache all comparisons.
@@ -244,7 +234,19 @@ class Assigner:
             score = scores.of(*pair)
             return 1 - NOISE_MARGIN / score if score > NOISE_MARGIN else 0.0
 
-        return _choose_assignments(pairs, parallel_map(compare, pairs))
+        similarities = parallel_map(compare, pairs)
+        # at most one pair for each view and each photo, so that the sum of their similarities is largest
+        possible = [(*pair, similarity) for pair, similarity in zip(pairs, similarities, strict=True) if similarity > 0]
+        if not possible:
+            return {}
+        rows = sorted({view for view, _, _ in possible})
+        columns = sorted({assignment.photo for _, assignment, _ in possible})
+        table, assignments = np.zeros((len(rows), len(columns))), dict[tuple[int, int], Assignment]()
+        for view, assignment, similarity in possible:
+            row, column = rows.index(view), columns.index(assignment.photo)
+            table[row, column], assignments[row, column] = similarity, assignment
+        pairs_of_table = enumerate(_match_columns(table).tolist())  # column -1 for a row that gets none
+        return {rows[row]: assignments[row, column] for row, column in pairs_of_table if (row, column) in assignments}
 
     def list_likely(self, views: Sequence[int], photos: Sequence[int]) -> dict[int, list[Assignment]]:
         """List the ``photos`` with the highest scores in each of ``views``, the best first.
@@ -253,7 +255,7 @@ class Assigner:
         """
         if not views or not photos:
             return {}
-        step, tag = -(-len(photos) // FIRST_PHOTOS), self.candidates.tag
+        step = -(-len(photos) // FIRST_PHOTOS)
         compared = set(range(0, len(photos), step))  # indices into ``photos``
         max_compared = 4  # number of photos that are compared with a view part by part
         while True:  # until all neighbours of the views' best photos are compared
@@ -267,12 +269,17 @@ class Assigner:
                 break
             compared, step = compared | neighbours, 1
 
-        def list_assignments(view: int) -> list[Assignment]:
-            """List the likely photos of a view, in their likely orientations."""
-            likely = [scores.photos[column] for column in columns[view] if np.isfinite(best[view, column])]
-            return [Assignment(photo, scores.choose_orientation(view, photo, tag(photo))) for photo in likely]
-
-        return {view: list_assignments(view) for view in views}
+        # The orientation in which a photo shows a view: the stored orientation, 0, is tried first, and that of its tag
+        # next. Each is chosen if no other scores clearly higher, or else the orientation with the highest score
+        likely: dict[int, list[Assignment]] = {view: [] for view in views}
+        for view in views:
+            for column in columns[view]:
+                if np.isfinite(best[view, column]):
+                    photo, values = scores.photos[column], np.nan_to_num(scores.values[view, column], nan=-np.inf)
+                    tried = (0, self.candidates.tag(photo))
+                    proposed = (turn for turn in tried if values[turn] > values.max() - SIGNIFICANT)
+                    likely[view].append(Assignment(photo, next(proposed, int(values.argmax()))))
+        return likely
 
 
 def assign_photos(
@@ -322,24 +329,6 @@ def _exceed_noise(scores: np.ndarray) -> bool:
     The test uses the median, because a single extreme score hardly moves a median.
     """
     return bool(len(scores) and median(scores) * np.sqrt(len(scores)) > SIGNIFICANT)
-
-
-def _choose_assignments(pairs: Sequence[tuple[int, Assignment]], scores: Sequence[float]) -> dict[int, Assignment]:
-    """Choose at most one pair for each view and each photo, so that the sum of their scores is largest.
-
-    Pairs with a score of 0 are not chosen. Returns the assignment of each view that has a pair.
-    """
-    possible = [(*pair, score) for pair, score in zip(pairs, scores, strict=True) if score > 0]
-    if not possible:
-        return {}
-    views = sorted({view for view, _, _ in possible})
-    photos = sorted({assignment.photo for _, assignment, _ in possible})
-    table, assignments = np.zeros((len(views), len(photos))), dict[tuple[int, int], Assignment]()
-    for view, assignment, score in possible:
-        table[views.index(view), photos.index(assignment.photo)] = score
-        assignments[view, assignment.photo] = assignment
-    matched = ((view, photos[column]) for view, column in zip(views, _match_columns(table), strict=True) if column >= 0)
-    return {view: assignments[view, photo] for view, photo in matched if (view, photo) in assignments}
 
 
 def _match_columns(scores: np.ndarray) -> np.ndarray:

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
@@ -25,9 +24,9 @@ SOLID_BLOCK = 0.2  # opacity above which a block is compared; fainter blocks sho
 TONE_LEVELS = 33  # number of quantiles of a tone curve
 EXPOSURE_STEP = 0.05  # change of middle grey by a third of a stop, the smallest exposure step of cameras
 VISIBLE = 0.01  # root mean square of differences that are just visible on plain surfaces
-ChangeColors = Callable[[np.ndarray], np.ndarray]  # maps colours [...,3]
-# Fits a change to colours [n,3], their targets [n,3] and weights [n]
-FitColors = Callable[[np.ndarray, np.ndarray, np.ndarray], ChangeColors]
+# Changes colours [...,3], the first argument, by a change that is fitted to the other arguments: colours [n,3], their
+# targets [n,3] and weights [n]
+ChangeColors = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +140,10 @@ def tone_blocks(pairs: Pairs, groups: Sequence[Sequence[int]]) -> Blocks:
         group_pairs = pairs[group]
         shown = group_pairs.shown
         toned[group] = _cross_fit(
-            group_pairs.photos, shown.pictures, shown.weights, lambda *colors: partial(map_tones, fit_tones(*colors))
+            group_pairs.photos,
+            shown.pictures,
+            shown.weights,
+            lambda photo, *fitted: map_tones(fit_tones(*fitted), photo),
         )
 
     parallel_map(change_group, groups)
@@ -154,35 +156,34 @@ def map_blocks(blocks: Blocks) -> Blocks:
         blocks.photos,
         blocks.pictures,
         blocks.solid.astype(np.float32),
-        lambda *colors: partial(map_colors, fit_map(*colors)),
+        lambda photo, *fitted: map_colors(fit_map(*fitted), photo),
     )
     return Blocks(mapped, blocks.pictures, blocks.solid)
 
 
 def plain_blocks(blocks: Blocks) -> Blocks:
     """Return the blocks with photos of one colour, the mean colour of the Gaussians that :func:`_cross_fit` finds."""
-    plain = _cross_fit(blocks.photos, blocks.pictures, blocks.solid.astype(np.float32), _plain_change)
+
+    def fill(photo: np.ndarray, _: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """Give every pixel the mean of the colours ``targets``."""
+        mean = (targets * weights[:, None]).sum(0, dtype=np.float64) / max(float(weights.sum(dtype=np.float64)), 1e-9)
+        return np.full_like(photo, mean)
+
+    plain = _cross_fit(blocks.photos, blocks.pictures, blocks.solid.astype(np.float32), fill)
     return Blocks(plain, blocks.pictures, blocks.solid)
 
 
-def _plain_change(_: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> ChangeColors:
-    """Return the change that gives every pixel the mean of the colours ``targets``."""
-    mean = (targets * weights[:, None]).sum(0, dtype=np.float64) / max(float(weights.sum(dtype=np.float64)), 1e-9)
-    return partial(np.full_like, fill_value=mean)
-
-
-def _cross_fit(photos: np.ndarray, pictures: np.ndarray, weights: np.ndarray, fit: FitColors) -> np.ndarray:
+def _cross_fit(photos: np.ndarray, pictures: np.ndarray, weights: np.ndarray, change: ChangeColors) -> np.ndarray:
     """Fit a change to the white blocks of photos ``[v,h,w,3]``, apply it to the black blocks, and vice versa.
 
-    ``fit`` maps photos to ``pictures [v,h,w,3]``, with ``weights [v,h,w]``.
+    The ``change`` maps photos to ``pictures [v,h,w,3]``, with ``weights [v,h,w]``.
     """
     out, block_side = np.empty_like(photos), max(1.0, max(photos.shape[1:3]) / BLOCKS)
     y, x = ((np.arange(size) / block_side).astype(int) for size in photos.shape[1:3])
     black_squares = (y[:, None] + x) % 2 == 1  # like those of a chess board
     for fold in (black_squares, ~black_squares):
         colors, targets = photos[:, ~fold].reshape(-1, 3), pictures[:, ~fold].reshape(-1, 3)
-        change = fit(colors, targets, weights[:, ~fold].reshape(-1))
-        out[:, fold] = change(photos[:, fold])
+        out[:, fold] = change(photos[:, fold], colors, targets, weights[:, ~fold].reshape(-1))
     return out
 
 

@@ -35,15 +35,13 @@ from gsmerge.io.photo_files import (
     same_shape,
 )
 from gsmerge.kernels.pictures import turn_picture
-from gsmerge.raster.photos import row_pictures, shrink_pictures
+from gsmerge.raster.photos import row_pictures
 from gsmerge.reading.alignment import ESTIMATED
 from gsmerge.reading.photos.assign_photos import Assigner, Candidates, assign_photos
-from gsmerge.reading.photos.colors import cut_blocks
 from gsmerge.reading.photos.grid_fit import WHOLE_FIT, GridFit, PartFit, choose_fit, list_fits
 from gsmerge.reading.photos.offsets import OFFSET_PIXELS, correlate_parts
 from gsmerge.reading.photos.photo_folders import capture_folder, count_pixels, find_named_photos
-from gsmerge.reading.photos.similarity import stands_out
-from gsmerge.reading.photos.view_pictures import Pairs, ViewPictures, show_views
+from gsmerge.reading.photos.view_pictures import show_views
 from gsmerge.reading.scene_files import SceneFiles
 from gsmerge.runtime.record import list_some
 from gsmerge.runtime.threads import parallel_map
@@ -352,20 +350,6 @@ def has_other_shape(photos: ScenePhotos, camera_file: CameraFile) -> bool:
         return False
     size = photos.fit.stretch(part_size(image_size(first), photos.fit.part))
     return not any(same_shape(shape, turned) for shape in shapes for turned in (size, size[::-1]))
-
-
-def has_nearer_colors(scene: Scene, other: Scene) -> bool:
-    """Return whether a scene's colours are nearer to its photos than the colours of the scene ``other`` are."""
-    images = scene.images
-    assert images is not None
-
-    def measure_errors(shown: ViewPictures) -> np.ndarray:
-        """Return the differences ``[n]`` between blocks of pictures and the same blocks of the scene's photos."""
-        return cut_blocks(Pairs(shrink_pictures(images, *shown.weights.shape[2:0:-1]), shown)).errors()
-
-    return stands_out(
-        measure_errors(show_views(other, OFFSET_PIXELS)) - measure_errors(show_views(scene, OFFSET_PIXELS))
-    )
 
 
 def name_by_photos(camera_file: CameraFile, photos: ScenePhotos) -> CameraFile:

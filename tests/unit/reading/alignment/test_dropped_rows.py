@@ -45,14 +45,14 @@ def test_a_grid_with_dropped_rows_is_found_wherever_gaussians_are_in_their_pixel
     kept = da3_rows(tiny)
     grid = find_dropped_grid(points[kept].astype(np.float32), np.ones(len(kept), bool))
     assert grid is not None
-    layout, calibration = grid
+    layout, cameras = grid
     assert (layout.width, layout.height) == (90, 68)
     rows = np.flatnonzero(layout.pixel_ids() >= 0)
     y, x = np.divmod(layout.pixel_ids()[rows] % (layout.width * layout.height), layout.width)
     true_y, true_x = np.divmod(kept[rows] % (96 * 72), 96)
     assert len(rows) >= 0.99 * len(kept)
     assert np.mean((x + 3 == true_x) & (y + 2 == true_y)) > 0.99
-    assert np.allclose(calibration.cameras.Ks[:, 0, 0], tiny.K[0, 0], rtol=0.03)
+    assert np.allclose(cameras.Ks[:, 0, 0], tiny.K[0, 0], rtol=0.03)
 
 
 @pytest.mark.parametrize("index", ["shuffled", "sorted", "voxels"])
