@@ -6,10 +6,9 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
 from typing import Any
 
 from gsmerge.runtime.memory import memory_problem
@@ -41,8 +40,15 @@ class ProcessPool(WorkerPool):
         executor = self.idle.pop() if self.idle else ProcessPoolExecutor(
             1, multiprocessing.get_context("spawn"), initializer=begin_worker
         )  # fmt: skip
-        with _library_threads(self.threads):  # because the first call of an executor starts its process
+        # The first call of an executor starts its process, in which libraries that NumPy uses get as many threads
+        before = {name: os.environ[name] for name in THREAD_VARIABLES if name in os.environ}
+        os.environ.update(dict.fromkeys(THREAD_VARIABLES, str(self.threads)))
+        try:
             self.calls[executor.submit(function, *call.arguments)] = call, executor
+        finally:
+            for name in THREAD_VARIABLES:
+                del os.environ[name]
+            os.environ.update(before)
 
     def wait(self) -> list[tuple[Any, Any]]:
         """Wait until a call ends; return the keys and results of all calls that have ended."""
@@ -64,19 +70,6 @@ class ProcessPool(WorkerPool):
                 process.kill()
         for executor in [*self.idle, *busy]:
             executor.shutdown(cancel_futures=True)
-
-
-@contextmanager
-def _library_threads(count: int) -> Iterator[None]:
-    """Let libraries that NumPy uses have ``count`` threads in each process that is started within the block."""
-    before = {name: os.environ[name] for name in THREAD_VARIABLES if name in os.environ}
-    os.environ.update(dict.fromkeys(THREAD_VARIABLES, str(count)))
-    try:
-        yield
-    finally:
-        for name in THREAD_VARIABLES:
-            del os.environ[name]
-        os.environ.update(before)
 
 
 def begin_worker() -> None:

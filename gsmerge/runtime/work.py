@@ -92,11 +92,31 @@ def start_work(engine: str, address: str | None = None, *, threads: int | None, 
 
 
 class Cluster:
-    """A connection to a Ray cluster."""
+    """A connection to the Ray cluster at ``address``; if this is None, a cluster is started on this machine.
+
+    ``store_bytes`` is the memory for shared objects of a cluster that is started.
+    """
 
     def __init__(self, address: str | None, *, store_bytes: int | None = None) -> None:
-        self.ray = require_ray()
-        _connect(self.ray, address, store_bytes)
+        self.ray = ray = require_ray()
+        os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # Ray would hide GPUs from calls
+        os.environ.setdefault("RAY_task_oom_retries", str(RETRIES))  # of tasks that Ray ends when memory runs out
+        quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.ERROR}
+        if ray.is_initialized():
+            raise UsageError("engine ray: expected a process without a connection to Ray; call ray.shutdown() first")
+        if address is None:
+            os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+            ray.init(address="local", include_dashboard=False, object_store_memory=store_bytes, **quiet)
+            return
+        try:
+            host, _, port = address.removeprefix("ray://").rpartition(":")
+            if host and port.isdecimal():  # if nothing listens there, Ray itself would wait for minutes
+                connect_timeout = 10.0  # seconds to reach a cluster
+                socket.create_connection((host.strip("[]"), int(port)), timeout=connect_timeout).close()
+            ray.init(address=address, **quiet)
+        except (OSError, ValueError, RuntimeError) as error:
+            problem = f"no Ray cluster answers there ({' '.join(str(error).split())[:200]})"
+            raise SceneError(address, problem, "start one with ray start --head") from error
 
     @property
     def processors(self) -> int:
@@ -236,28 +256,3 @@ def require_ray() -> ModuleType:
     except ImportError as error:
         raise UsageError('engine ray: Ray is not installed; run pip install "ray>=2.9,<3"') from error
     return ray
-
-
-def _connect(ray: ModuleType, address: str | None, store_bytes: int | None) -> None:
-    """Connect to the Ray cluster at ``address``, or if ``address`` is None, start a cluster on this machine.
-
-    ``store_bytes`` is the memory for shared objects of a cluster that is started.
-    """
-    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # Ray would hide GPUs from calls
-    os.environ.setdefault("RAY_task_oom_retries", str(RETRIES))  # of tasks that Ray ends when memory runs out
-    quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.ERROR}
-    if ray.is_initialized():
-        raise UsageError("engine ray: expected a process without a connection to Ray; call ray.shutdown() first")
-    if address is None:
-        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-        ray.init(address="local", include_dashboard=False, object_store_memory=store_bytes, **quiet)
-        return
-    try:
-        host, _, port = address.removeprefix("ray://").rpartition(":")
-        if host and port.isdecimal():  # if nothing listens there, Ray itself would wait for minutes
-            connect_timeout = 10.0  # seconds to reach a cluster
-            socket.create_connection((host.strip("[]"), int(port)), timeout=connect_timeout).close()
-        ray.init(address=address, **quiet)
-    except (OSError, ValueError, RuntimeError) as error:
-        problem = f"no Ray cluster answers there ({' '.join(str(error).split())[:200]})"
-        raise SceneError(address, problem, "start one with ray start --head") from error
