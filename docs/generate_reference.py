@@ -142,8 +142,7 @@ def _settings_page() -> str:
     """Return the page of all settings that are not options, by topic."""
     from gsmerge.settings.compact import CompactOptions
     from gsmerge.settings.extend import ExtendOptions
-    from gsmerge.settings.files import FileOptions
-    from gsmerge.settings.placement import PlacementOptions
+    from gsmerge.settings.files import FileOptions, PlacementOptions
     from gsmerge.settings.reading import FileHints
     from gsmerge.settings.setting import flat_settings, settings_of
 

@@ -25,8 +25,7 @@ from gsmerge.runtime import documents
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.evaluate import EvaluateOptions
 from gsmerge.settings.extend import ExtendOptions
-from gsmerge.settings.files import FileOptions
-from gsmerge.settings.placement import PlacementOptions
+from gsmerge.settings.files import FileOptions, PlacementOptions
 from gsmerge.settings.reading import FileHints
 from gsmerge.settings.setting import flat_settings
 

@@ -7,8 +7,7 @@ from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import print_document, say, say_notes, stage_progress
 from gsmerge.cli.paths import check_outputs, output_file
 from gsmerge.errors import UsageError
-from gsmerge.settings.files import FileOptions
-from gsmerge.settings.placement import PlacementOptions
+from gsmerge.settings.files import FileOptions, PlacementOptions
 from gsmerge.settings.stages import CleanOptions
 
 SETTINGS = (FileOptions, CleanOptions, PlacementOptions)

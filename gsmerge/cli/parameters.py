@@ -23,7 +23,7 @@ from gsmerge.errors import UsageError
 from gsmerge.runtime.plugins import LazyFunction
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.evaluate import NETS, EvaluateOptions
-from gsmerge.settings.placement import PlacementOptions
+from gsmerge.settings.files import PlacementOptions
 from gsmerge.settings.reading import NONE, FileHints, OpacityChoice, ReadHints
 from gsmerge.settings.setting import Setting, flat_settings, join_words, suggest_name
 from gsmerge.settings.stages import Engine

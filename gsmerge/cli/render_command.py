@@ -9,7 +9,7 @@ from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import print_document, say_notes, stage_progress
 from gsmerge.cli.paths import check_folder, check_outputs, input_files
 from gsmerge.errors import UsageError
-from gsmerge.settings.pictures import CLIPS, PICTURES
+from gsmerge.settings.files import CLIPS, PICTURES
 from gsmerge.settings.setting import Setting
 
 MAX_SIDE = 1 << 20  # pixels; larger than any camera, so that pictures keep the size of the cameras

@@ -23,7 +23,7 @@ from gsmerge.errors import SceneError
 from gsmerge.io import atomic_output
 from gsmerge.io.image_names import CLIP_ENDS
 from gsmerge.kernels.elementary import sin
-from gsmerge.settings.pictures import GIF
+from gsmerge.settings.files import GIF
 from gsmerge.types import StrPath
 
 # Code and name of the encoders for each ending. The first encoder that OpenCV has is used. Browsers play all but

@@ -46,7 +46,7 @@ from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.record import Progress, record_run
 from gsmerge.runtime.threads import use_threads
 from gsmerge.scoring.sizes import fill_cameras, fill_photo, shrink_cameras
-from gsmerge.settings.pictures import CLIPS, GIF, PICTURES
+from gsmerge.settings.files import CLIPS, GIF, PICTURES
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.types import Cameras, Gaussians, StrPath
 

@@ -30,7 +30,7 @@ from gsmerge.runtime.documents import document_head, note_entries
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.record import report_progress
 from gsmerge.runtime.threads import use_threads
-from gsmerge.settings.placement import AXES, PlacementOptions, parse_triple
+from gsmerge.settings.files import AXES, PlacementOptions, parse_triple
 from gsmerge.settings.reading import NONE, ColorChoice, OpacityChoice, ScaleChoice
 from gsmerge.settings.stages import CleanOptions
 from gsmerge.stages.clean import clean, describe_counts

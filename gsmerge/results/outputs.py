@@ -17,8 +17,7 @@ from gsmerge.io.cameras.viewer_cameras import is_own_settings, viewer_cameras, v
 from gsmerge.io.formats.table import TILESET, Contents, Format, output_format
 from gsmerge.prepare.place_cameras import place_viewpoints
 from gsmerge.settings.compact import OURS, CompactOptions
-from gsmerge.settings.files import FileOptions
-from gsmerge.settings.placement import AXES
+from gsmerge.settings.files import AXES, FileOptions
 from gsmerge.stages.counts import STREAMED_LEVELS
 from gsmerge.types import Cameras, Gaussians, Scene
 

@@ -24,7 +24,7 @@ from gsmerge.drawing.pages.view import Page
 from gsmerge.io.formats.table import FORMATS
 from gsmerge.results.report import report_document
 from gsmerge.settings.compact import method_names
-from gsmerge.settings.placement import PlacementOptions
+from gsmerge.settings.files import PlacementOptions
 from gsmerge.settings.setting import flat_settings
 from gsmerge.types import Pixels
 

@@ -25,7 +25,7 @@ from gsmerge.io.formats.streamed import read_index, read_level
 from gsmerge.io.formats.table import Contents, Format
 from gsmerge.jobs.convert import ConvertOptions, convert_files, find_placement, join_gaussians, rotation_between
 from gsmerge.results.outputs import name_outputs
-from gsmerge.settings.placement import AXES, PlacementOptions
+from gsmerge.settings.files import AXES, PlacementOptions
 from gsmerge.settings.stages import CleanOptions
 from gsmerge.types import Gaussians
 

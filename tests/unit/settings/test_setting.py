@@ -12,7 +12,7 @@ import pytest
 
 from gsmerge import CompactOptions
 from gsmerge.settings.evaluate import EvaluateOptions
-from gsmerge.settings.placement import PlacementOptions
+from gsmerge.settings.files import PlacementOptions
 from gsmerge.settings.setting import Settings, flat_settings, setting, settings_of
 
 

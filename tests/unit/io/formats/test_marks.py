@@ -12,7 +12,7 @@ from slow_readers import corners
 from gsmerge.io import kept_comments, read_gaussians, write_gaussians, write_ply
 from gsmerge.jobs.convert import ConvertOptions, convert_files
 from gsmerge.results.outputs import name_outputs
-from gsmerge.settings.placement import PlacementOptions
+from gsmerge.settings.files import PlacementOptions
 
 
 def write_marked(path: Path, *comments: str) -> Path:
