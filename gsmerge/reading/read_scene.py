@@ -37,9 +37,8 @@ from gsmerge.reading.larger_photos import (
     read_scene_cameras,
 )
 from gsmerge.reading.loaded import Loaded
-from gsmerge.reading.photos.grid_fit import WHOLE_FIT, has_bars
+from gsmerge.reading.photos.grid_fit import WHOLE_FIT, choose_part, has_bars
 from gsmerge.reading.photos.masks import CameraMaskError, check_masks
-from gsmerge.reading.photos.parts import choose_part
 from gsmerge.reading.photos.scene_photos import (
     NO_PHOTOS,
     ScenePhotos,

@@ -1,21 +1,24 @@
 """Find which part of the photos the views show, and how photos were resized to the grid of a file's rows.
 
 Photos of another shape than their cameras may have bars, or show both eyes of a stereo camera or several pictures side
-by side. If a file has no cameras, its model may have cropped the photos or changed their aspect ratio, and may have cut
-borders off its output. The choice of part and resizing is the one by which photos best match the pictures of the
-Gaussians.
+by side. Bars are cut off, and one of the pictures is used. If a file has no cameras, its model may have cropped the
+photos or changed their aspect ratio, and may have cut borders off its output. The choice of part and resizing is the
+one by which photos best match the pictures of the Gaussians.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from gsmerge.io.cameras.camera_file import CameraFile
+from gsmerge.errors import SceneError
+from gsmerge.geometry.views import pick_views
+from gsmerge.io.cameras.camera_file import CameraFile, sizes_of
 from gsmerge.io.photo_files import (
     ASPECT_TOLERANCE,
     WHOLE,
@@ -23,6 +26,10 @@ from gsmerge.io.photo_files import (
     PhotoTransform,
     Size,
     cut_part,
+    decode_image,
+    image_size,
+    limit_size,
+    orientation_turn,
     part_size,
     resize_and_crop,
     resize_to,
@@ -30,9 +37,15 @@ from gsmerge.io.photo_files import (
 )
 from gsmerge.kernels.pictures import count_bars
 from gsmerge.reading.alignment import TRIMS
-from gsmerge.reading.photos.offsets import correlate_parts
+from gsmerge.reading.photos.assign_photos import Assigner, Assignment, Candidates
+from gsmerge.reading.photos.offsets import OFFSET_PIXELS, correlate_parts
 from gsmerge.reading.photos.similarity import stands_out
-from gsmerge.reading.photos.view_pictures import ViewPictures
+from gsmerge.reading.photos.view_pictures import ViewPictures, show_views
+from gsmerge.runtime.threads import parallel_map
+from gsmerge.types import Scene
+
+if TYPE_CHECKING:
+    from gsmerge.reading.photos.scene_photos import ScenePhotos
 
 BAR_SPREAD = 8  # largest difference of the colours within a bar, of 255
 _TILES = 4  # largest number of pictures in a row or a column of a photo
@@ -198,6 +211,52 @@ def choose_fit(shown: ViewPictures, photos: Sequence[np.ndarray | None], fits: S
         if stands_out(correlations - best_correlations):
             best, best_correlations = fit, correlations
     return best
+
+
+def choose_part(
+    scene: Scene, photos: ScenePhotos, camera_file: CameraFile, grid_fit: GridFit | None = None
+) -> ScenePhotos | None:
+    """Find the part of the proposed photos that shows the views, and return photos of which this part is used.
+
+    None if no part fits better than whole photos, or if even the best part does not look like the views
+    (:meth:`Assigner.explain_most`). None also if photos differ in shape or have orientation tags. ``grid_fit`` is how
+    whole photos were resized, if the cameras were estimated.
+    """
+    named = [(view, path) for view, path in enumerate(photos.named) if path is not None]
+    max_compared = 8  # largest number of photos whose parts are compared with their views
+    views, paths = zip(*(named[i] for i in pick_views(len(named), max_compared)), strict=True) if named else ((), ())
+    sizes = [image_size(path) for path in paths]
+    shapes_differ = not all(same_shape(size, sizes[0]) for size in sizes)
+    if not paths or shapes_differ or any(map(orientation_turn, paths)):
+        return None
+
+    def read(number: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return a small photo, and the shares of its sides (left, above, right, below) that are bars."""
+        size = sizes[number]
+        with suppress(SceneError):
+            whole = decode_image(paths[number], size)
+            above, below, left, right = count_bars(whole, BAR_SPREAD)
+            small = resize_to(size, limit_size(size, 4 * OFFSET_PIXELS)).photos([whole])[0]
+            return small / np.float32(255), np.array([left, above, right, below]) / (size * 2)
+        return np.zeros((OFFSET_PIXELS, OFFSET_PIXELS, 3), np.float32), np.zeros(4)
+
+    pictures, bars = zip(*parallel_map(read, range(len(paths))), strict=True)
+    left, above, right, below = np.median(bars, 0).tolist()
+    inner = left, above, 1 - right, 1 - below  # the part inside of bars
+    view_size = next(iter(sizes_of(camera_file)), (scene.cameras.width, scene.cameras.height))
+    if grid_fit is None:
+        inner = round_to_cameras(inner, sizes[0], view_size)
+        fits: list[GridFit | PartFit] = [*list_parts(sizes[0], view_size, inner)]
+    else:  # cameras were estimated, so parts may have any shape
+        fits = [grid_fit, *list_parts(sizes[0], None, inner)]
+    fit = choose_fit(show_views(scene, OFFSET_PIXELS)[views], pictures, fits)
+    if isinstance(fit, GridFit) or fit == WHOLE_FIT:
+        return None
+    candidates = Candidates(read=lambda photo: fit.cut(pictures[photo]), count=len(paths), tag=lambda _: 0)
+    assigner = Assigner(lambda side: show_views(scene, side)[views], candidates)
+    is_right = assigner.explain_most([Assignment(photo, 0) for photo in range(len(paths))])
+    note = fit.describe(sizes[0], bars=fit.part == inner != WHOLE)
+    return replace(photos, fit=fit, notes=(*photos.notes, note)) if is_right else None
 
 
 def has_bars(images: np.ndarray | None) -> bool:
