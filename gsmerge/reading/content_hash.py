@@ -15,7 +15,7 @@ from gsmerge.io import SCENE_SUFFIXES, read_cameras
 from gsmerge.io.bounds import read_errors, walk_files
 from gsmerge.io.cameras.dataparser import DATAPARSER
 from gsmerge.io.cameras.foreign import INTRINSICS
-from gsmerge.io.cameras.long_lrm import FRAMES_FILE
+from gsmerge.io.cameras.programs import FRAMES_FILE
 from gsmerge.reading.photos.scene_photos import find_photos
 from gsmerge.reading.scene_files import SceneFiles
 

@@ -137,8 +137,8 @@ def make_camera_file(
 
     Intrinsics that are small in all views are taken as divided by the image's size, and are converted to pixels.
     ``images [c,h,w,3]`` are images inside the file, and ``order`` is the order of rows that the file states. Raise
-    SceneError if there is no camera, a number is infinite or too large, a rotation is not orthonormal, or a focal
-    length is not positive.
+    SceneError if there is no camera, a pose is not 3x4 or 4x4, a number is infinite or too large, a rotation is not
+    orthonormal, or a focal length is not positive.
     """
     if not views:
         raise SceneError(path, "expected at least one camera, found none")
@@ -148,8 +148,18 @@ def make_camera_file(
         focals = [float(max(view.size)) or 1.0 for view in views]
         views = [view._replace(K=make_pinhole(f, f, 0, 0)) for view, f in zip(views, focals, strict=True)]
     poses, Ks = np.tile(np.eye(4), (len(views), 1, 1)), np.array([view.K for view in views], np.float64)
+    max_coefficient = 1e6  # smaller coefficients are checked by their effect, when photos are undistorted
     for i, view in enumerate(views):
-        poses[i, :3] = _check_view(path, view)[:3]
+        pose = np.asarray(view.pose, np.float64)
+        if pose.shape not in ((3, 4), (4, 4)):
+            raise SceneError(path, f"view {view.name}: expected a pose of 3x4 or 4x4 numbers, found {pose.shape}")
+        lens = view.lens or Lens("", "perspective", ())
+        for name, coefficient in zip(COEFFICIENTS[lens.model], lens.coefficients, strict=False):
+            if not abs(coefficient) <= max_coefficient:  # also refuses NaN
+                problem = f"expected a lens coefficient {name} within +-{max_coefficient:g}, found {coefficient:g}"
+                text = f"view {view.name}: {problem} ({lens.name})"
+                raise SceneError(path, text, "correct it, or undistort the images first")
+        poses[i, :3] = pose[:3]
         check_camera(path, view.name, poses[i], Ks[i])
     for w, h in (view.size for view in views):
         if not (0 <= w <= _MAX_SIDE and 0 <= h <= _MAX_SIDE):
@@ -179,21 +189,6 @@ def make_camera_file(
         masks={view.name: view.mask for view in views if view.mask},
         has_intrinsics=not lacks_intrinsics,
     )
-
-
-def _check_view(path: StrPath, view: StoredView) -> np.ndarray:
-    """Return a view's pose; raise SceneError unless it is 3x4 or 4x4, or if a lens coefficient is far too large."""
-    pose = np.asarray(view.pose, np.float64)
-    if pose.shape not in ((3, 4), (4, 4)):
-        raise SceneError(path, f"view {view.name}: expected a pose of 3x4 or 4x4 numbers, found {pose.shape}")
-    max_coefficient = 1e6  # smaller coefficients are checked by their effect, when photos are undistorted
-    lens = view.lens or Lens("", "perspective", ())
-    for name, coefficient in zip(COEFFICIENTS[lens.model], lens.coefficients, strict=False):
-        if not abs(coefficient) <= max_coefficient:  # also refuses NaN
-            problem = f"expected a lens coefficient {name} within +-{max_coefficient:g}, found {coefficient:g}"
-            text = f"view {view.name}: {problem} ({lens.name})"
-            raise SceneError(path, text, "correct it, or undistort the images first")
-    return pose
 
 
 def check_camera_count(path: StrPath, count: int) -> None:
@@ -344,8 +339,13 @@ def as_pinholes(camera_file: CameraFile, photos: PhotoArrays) -> tuple[CameraFil
             raise SceneError(camera_file.path, problem, "give the images as they were taken, or undistort them first")
     Ks = to_cameras(pinholes, size).Ks
     for view, K, lens in zip(camera_file.names, Ks, camera_file.lenses, strict=True):
-        share = 1.0 if lens is None else _share_inside(K, lens, size)
-        if lens is not None and share < _MIN_INSIDE:
+        if lens is None:
+            continue
+        # The share of an undistorted photo's pixels that lie within the original photo is counted on a coarse grid
+        grid = 32  # pixels of each side of the grid
+        maps = _rectify_maps(K * np.array([grid / size[0], grid / size[1], 1.0])[:, None], lens, (grid, grid))
+        share = float(np.all([(positions >= -0.5) & (positions <= grid - 0.5) for positions in maps], 0).mean())
+        if share < _MIN_INSIDE:
             coefficients = zip(COEFFICIENTS[lens.model], lens.coefficients, strict=False)
             nonzero = ", ".join(f"{key} = {coefficient:g}" for key, coefficient in coefficients if coefficient)
             problem = f"view {view}: expected {lens.name} coefficients of a lens, found {nonzero}, with which"
@@ -353,14 +353,6 @@ def as_pinholes(camera_file: CameraFile, photos: PhotoArrays) -> tuple[CameraFil
             raise SceneError(camera_file.path, problem, "correct them, or undistort the images first")
     undistorted = undistort_photos(photos, Ks, camera_file.lenses)
     return pinholes, undistorted, [f"the photos are undistorted ({name}); the intrinsics stay"]
-
-
-def _share_inside(K: np.ndarray, lens: Lens, size: Size) -> float:
-    """Return the share of an undistorted photo's pixels that lie within the original photo, by a coarse grid."""
-    grid = 32  # pixels of each side of the grid
-    grid_K = K * np.array([grid / size[0], grid / size[1], 1.0])[:, None]
-    maps = _rectify_maps(grid_K, lens, (grid, grid))
-    return float(np.all([(positions >= -0.5) & (positions <= grid - 0.5) for positions in maps], 0).mean())
 
 
 def undistort_photos(photos: PhotoArrays, Ks: np.ndarray, lenses: Sequence[Lens | None]) -> PhotoArrays:

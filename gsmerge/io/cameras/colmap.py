@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import struct
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -48,15 +48,7 @@ def read_colmap(source: CameraSource, suffix: str) -> StoredCameras:
     folder = source.path
     camera_path, image_path = folder / f"cameras{suffix}", folder / f"images{suffix}"
     try:
-        if suffix == ".bin":
-            # Files are not mapped, since a mapped file that becomes shorter ends the process
-            with camera_path.open("rb") as file:
-                cameras = _binary_cameras(camera_path, file)
-            with image_path.open("rb") as file:
-                images = _binary_images(image_path, file)
-        else:
-            cameras = _text_cameras(camera_path, read_lines(camera_path))
-            images = _text_images(image_path, read_lines(image_path, MAX_MODEL_BYTES), cameras)
+        cameras, images = (_read_binary if suffix == ".bin" else _read_text)(camera_path, image_path)
         unknown = next((name for name, camera, _ in images if camera not in cameras), None)
         if unknown is not None:
             raise SceneError(image_path, f"view {unknown}: its camera is not in cameras{suffix}")
@@ -119,53 +111,49 @@ def _make_view(path: Path, camera_id: int, model: str, size: tuple[int, int], pa
     K = make_pinhole(params[0], *params[:3]) if model in _ONE_FOCAL else make_pinhole(*params[:4])
     distortion = params[num_intrinsics : _NUM_PARAMS[model]]
     lens = make_lens(model, "fisheye" if model in _FISHEYE_MODELS else "perspective", distortion)
-    return StoredView("", np.eye(4), K, size if lens else _size_for_intrinsics(K, size), lens)
+    if lens is None:
+        # WorldMirror 1 stores the size of the photos, but intrinsics for the smaller images that the network reads.
+        # Twice the principal point is taken as the size of these images if it has whole numbers, is clearly smaller
+        # than the photos, and has the photos' aspect ratio
+        sides = 2 * K[:2, 2]
+        ratio_x, ratio_y = sides / np.maximum(size, 1)
+        max_difference = 0.01  # two images have the same shape if the ratios of their sides differ by at most this
+        has_photo_shape = abs(ratio_x - ratio_y) <= max_difference * abs(ratio_x)
+        smaller_ratio = 0.9  # the size is that of a smaller input if the ratio of the sides is below this
+        is_input = has_photo_shape and ratio_x < smaller_ratio and (sides == np.rint(sides)).all()
+        size = (int(sides[0]), int(sides[1])) if is_input else size
+    return StoredView("", np.eye(4), K, size, lens)
 
 
-def _size_for_intrinsics(K: np.ndarray, size: tuple[int, int]) -> tuple[int, int]:
-    """Return the image size to which intrinsics belong: the stored size, or the size of WorldMirror 1's input.
+def _read_binary(camera_path: Path, image_path: Path) -> tuple[dict[int, StoredView], list[_Image]]:
+    """Read ``cameras.bin`` and ``images.bin``, whose points are skipped.
 
-    WorldMirror 1 stores the size of the photos, but intrinsics for the smaller images that the network reads. Twice the
-    principal point is taken as the size of these images if it has whole numbers, is clearly smaller than the photos,
-    and has the photos' aspect ratio.
+    Return a view without name and pose for each camera, by the camera's id, and the images. Files are not mapped, since
+    a mapped file that becomes shorter ends the process.
     """
-    sides = 2 * K[:2, 2]
-    ratio_x, ratio_y = sides / np.maximum(size, 1)
-    max_difference = 0.01  # two images have the same shape if the ratios of their sides differ by at most this share
-    has_photo_shape = abs(ratio_x - ratio_y) <= max_difference * abs(ratio_x)
-    smaller_ratio = 0.9  # the size is that of a smaller input if the ratio of the sides is below this
-    is_input = has_photo_shape and ratio_x < smaller_ratio and (sides == np.rint(sides)).all()
-    return (int(sides[0]), int(sides[1])) if is_input else size
-
-
-def _binary_cameras(path: Path, file: BinaryIO) -> dict[int, StoredView]:
-    """Read ``cameras.bin``. Return a view without name and pose for each camera, by the camera's id."""
-    (count,) = _read_numbers(file, "<Q")
-    check_camera_count(path, count)
     cameras = {}
-    for _ in range(count):
-        camera_id, model_id, width, height = _read_numbers(file, "<iiQQ")
-        model = _MODEL_NAMES.get(model_id, f"model {model_id}")
-        params = list(_read_numbers(file, f"<{_NUM_PARAMS.get(model, 0)}d"))
-        cameras[camera_id] = _make_view(path, camera_id, model, (width, height), params)
-    return cameras
-
-
-def _binary_images(path: Path, file: BinaryIO) -> list[_Image]:
-    """Read the name, camera and pose of each image in ``images.bin``, and skip its points."""
-    (count,) = _read_numbers(file, "<Q")
-    check_camera_count(path, count)
+    with camera_path.open("rb") as file:
+        (count,) = _read_numbers(file, "<Q")
+        check_camera_count(camera_path, count)
+        for _ in range(count):
+            camera_id, model_id, width, height = _read_numbers(file, "<iiQQ")
+            model = _MODEL_NAMES.get(model_id, f"model {model_id}")
+            params = list(_read_numbers(file, f"<{_NUM_PARAMS.get(model, 0)}d"))
+            cameras[camera_id] = _make_view(camera_path, camera_id, model, (width, height), params)
     images = []
-    for _ in range(count):
-        _, *numbers, camera = _read_numbers(file, "<i7di")
-        name = _read_name(file)
-        (num_points,) = _read_numbers(file, "<Q")
-        points_end = file.tell() + 24 * num_points  # a point has 24 bytes: x, y and an id
-        if points_end > os.fstat(file.fileno()).st_size:
-            raise ValueError("early end of file")
-        file.seek(points_end)
-        images.append((name, camera, _make_pose(numbers)))
-    return images
+    with image_path.open("rb") as file:
+        (count,) = _read_numbers(file, "<Q")
+        check_camera_count(image_path, count)
+        for _ in range(count):
+            _, *numbers, camera = _read_numbers(file, "<i7di")
+            name = _read_name(file)
+            (num_points,) = _read_numbers(file, "<Q")
+            points_end = file.tell() + 24 * num_points  # a point has 24 bytes: x, y and an id
+            if points_end > os.fstat(file.fileno()).st_size:
+                raise ValueError("early end of file")
+            file.seek(points_end)
+            images.append((name, camera, _make_pose(numbers)))
+    return cameras, images
 
 
 def _has_content(line: str) -> bool:
@@ -173,38 +161,33 @@ def _has_content(line: str) -> bool:
     return line.strip()[:1] not in ("", "#")
 
 
-def _text_cameras(path: Path, lines: Iterable[str]) -> dict[int, StoredView]:
-    """Parse the lines of ``cameras.txt``. Return what :func:`_binary_cameras` returns."""
-    cameras: dict[int, StoredView] = {}
-    for line in filter(_has_content, lines):
-        check_camera_count(path, len(cameras) + 1)
-        camera_id, model, width, height, *params = line.split(maxsplit=_MAX_WORDS)
-        if len(params) != _NUM_PARAMS.get(model, len(params)) or max(len(width), len(height)) > _MAX_DIGITS:
-            raise ValueError("wrong number of parameters, or digits")
-        size = int(width), int(height)
-        cameras[int(camera_id)] = _make_view(path, int(camera_id), model, size, [float(p) for p in params])
-    return cameras
-
-
-def _text_images(path: Path, lines: Iterable[str], cameras: Mapping[int, StoredView]) -> list[_Image]:
-    """Parse the lines of ``images.txt``. Return what :func:`_binary_images` returns.
+def _read_text(camera_path: Path, image_path: Path) -> tuple[dict[int, StoredView], list[_Image]]:
+    """Read ``cameras.txt`` and ``images.txt``. Return what :func:`_read_binary` returns.
 
     The line of an image has a pose, and a name that may have spaces. The next line lists the points of the image.
     Programs that rewrite the file may drop all lines of points, or only empty lines.
     """
+    cameras: dict[int, StoredView] = {}
+    for line in filter(_has_content, read_lines(camera_path)):
+        check_camera_count(camera_path, len(cameras) + 1)
+        camera_id, model, width, height, *params = line.split(maxsplit=_MAX_WORDS)
+        if len(params) != _NUM_PARAMS.get(model, len(params)) or max(len(width), len(height)) > _MAX_DIGITS:
+            raise ValueError("wrong number of parameters, or digits")
+        size = int(width), int(height)
+        cameras[int(camera_id)] = _make_view(camera_path, int(camera_id), model, size, [float(p) for p in params])
     images: list[_Image] = []
     after_image = False
-    for line in filter(_has_content, lines):
+    for line in filter(_has_content, read_lines(image_path, MAX_MODEL_BYTES)):
         if after_image and _lists_points(line, cameras):
             after_image = False
             continue
-        check_camera_count(path, len(images) + 1)
+        check_camera_count(image_path, len(images) + 1)
         _, *numbers, camera, name = line.split(maxsplit=9)
         if len(numbers) != 7:
             raise ValueError("expected a rotation and a position")
         images.append((name.strip(), int(camera), _make_pose([float(x) for x in numbers])))
         after_image = True
-    return images
+    return cameras, images
 
 
 def _lists_points(line: str, cameras: Mapping[int, StoredView]) -> bool:

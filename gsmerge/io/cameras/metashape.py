@@ -1,19 +1,21 @@
-"""Read the cameras of Metashape's ``.xml``."""
+"""Read the cameras of Metashape's ``.xml``, within a budget of memory."""
 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
-from xml.etree.ElementTree import Element
+from xml.etree.ElementTree import Element, TreeBuilder
+from xml.parsers import expat
 
 import numpy as np
 
 from gsmerge.errors import SceneError
+from gsmerge.io.bounds import read_budget, read_text
 from gsmerge.io.cameras.camera_file import check_camera_count
 from gsmerge.io.cameras.camera_source import CameraSource, number_errors
 from gsmerge.io.cameras.view_layout import Entry
-from gsmerge.io.xml_files import read_xml
 
 _ATTRIBUTES = {"id", "type", "class", "width", "height", "sensor_id", "component_id", "label"}
 
@@ -21,11 +23,14 @@ _ATTRIBUTES = {"id", "type", "class", "width", "height", "sensor_id", "component
 def list_metashape_cameras(source: CameraSource) -> list[Entry]:
     """List the cameras of the component with the most cameras, each with the values of its sensor."""
     path = source.path
-    root, cameras = _largest_component(path)
+    root = _read_xml(path, _ATTRIBUTES)
+    cameras = [camera for camera in root.iter("camera") if camera.find("transform") is not None]
+    check_camera_count(path, len(cameras))
+    largest = dict(Counter(camera.get("component_id") for camera in cameras).most_common(1))
     sensors = {sensor.get("id"): sensor for sensor in root.iter("sensor")}
     values: dict[str | None, dict[str, Any]] = {}  # id of a sensor -> its values
     entries = []
-    for camera in cameras:
+    for camera in (camera for camera in cameras if camera.get("component_id") in largest):
         name, sensor_id = camera.get("label") or "", camera.get("sensor_id")
         if sensor_id not in sensors:
             raise SceneError(path, f"view {name}: expected the id of one of the sensors, found {sensor_id!r}")
@@ -58,10 +63,31 @@ def _sensor_values(sensor: Element) -> dict[str, Any]:
     return values | {"type": sensor.get("type", "frame")}
 
 
-def _largest_component(path: Path) -> tuple[Element, list[Element]]:
-    """Parse a file. Return the root element, and the largest set of cameras with poses that one component has."""
-    root = read_xml(path, _ATTRIBUTES)
-    cameras = [camera for camera in root.iter("camera") if camera.find("transform") is not None]
-    check_camera_count(path, len(cameras))
-    largest = dict(Counter(camera.get("component_id") for camera in cameras).most_common(1))
-    return root, [camera for camera in cameras if camera.get("component_id") in largest]
+def _read_xml(path: Path, attributes: Collection[str]) -> Element:
+    """Read an XML file. Its elements keep only ``attributes``, and names keep the prefixes of their namespaces.
+
+    The parser of Python's library may take far more memory than the file has bytes. The parser copies the address of a
+    namespace into the name of each tag, and needs thirty times the bytes of a tag with a million attributes.
+
+    Raise SceneError if the file is no XML or too large. Also raise SceneError if the file has a document type, since
+    entities in a document type could make a short text endless.
+    """
+    text, builder, parser = read_text(path), TreeBuilder(), expat.ParserCreate()
+    budget = read_budget(path)
+    element_bytes, attribute_bytes = 200, 330  # most bytes of memory for each "<" and "=" of a file
+    budget.check_memory(element_bytes * text.count("<") + attribute_bytes * text.count("="), "XML")
+
+    def start(tag: str, stored: Mapping[str, str]) -> None:
+        builder.start(tag, {name: stored[name] for name in attributes if name in stored})
+
+    def refuse(*_: object) -> None:
+        raise SceneError(path, "expected XML without a document type, found <!DOCTYPE", "remove that line")
+
+    parser.StartElementHandler, parser.EndElementHandler = start, builder.end
+    parser.CharacterDataHandler, parser.StartDoctypeDeclHandler = builder.data, refuse
+    parser.buffer_text = True
+    try:
+        parser.Parse(text, True)
+        return builder.close()
+    except (expat.ExpatError, AssertionError, LookupError, ValueError) as error:
+        raise SceneError(path, f"expected XML, found other text ({error})") from error

@@ -1,4 +1,4 @@
-"""Read cameras from ``.npz`` files: ``results.npz`` of Depth Anything 3, and ``views.npz`` of any model.
+"""Read cameras from NumPy's files: ``results.npz`` of Depth Anything 3, ``views.npz`` of any model, and InstantSplat's.
 
 A user whose model saves no cameras can write ``views.npz`` while the model runs (``examples/04_dump_views.py``). The
 arrays of ``views.npz``:
@@ -27,7 +27,9 @@ from gsmerge.io.archives import open_archive
 from gsmerge.io.bounds import check_file, check_image_size, read_budget
 from gsmerge.io.cameras.camera_file import C2W_OPENCV, MAX_NORMALISED_FOCAL, ORDERS, StoredView, check_camera_count
 from gsmerge.io.cameras.camera_source import CameraSource, StoredCameras
+from gsmerge.io.image_names import natural_key
 from gsmerge.io.photo_files import PhotoArrays
+from gsmerge.kernels.matrices import invert
 from gsmerge.runtime.threads import quiet_warnings
 
 # Names of arrays in the files of several programs. Names in files of Lyra 2 end with one of the words of ``_LYRA``
@@ -245,3 +247,27 @@ def read_matrices(path: Path) -> np.ndarray | None:
             matrices = np.load(path, allow_pickle=False).astype(np.float64)
             return matrices if np.isfinite(matrices).all() else None
     return None
+
+
+def take_optimised_poses(source: CameraSource, views: list[StoredView]) -> list[StoredView]:
+    """Replace the poses of views by the optimised poses of InstantSplat's last iteration.
+
+    These are in files beside the ``cameras.json`` with the initial poses.
+    Views stay unchanged if InstantSplat wrote no optimised poses, or if the optimisation started from other poses than
+    those of the file.
+    """
+    paths = (source.path.parent / "pose").glob("ours_*/pose_optimized.npy")
+    last_path = max(paths, key=lambda path: natural_key(path.parent.name), default=None)
+    if last_path is None:
+        return views
+    original, optimised = read_matrices(last_path.with_name("pose_org.npy")), read_matrices(last_path)
+    if original is None or optimised is None or not len(original) == len(optimised) == len(views):
+        return views
+    try:
+        first_poses, poses = invert(original)[:, :3], invert(optimised)[:, :3]
+    except np.linalg.LinAlgError:
+        return views
+    same_pose = 1e-4  # largest difference of numbers in two files with the same poses, absolute and relative
+    if not np.allclose([view.pose for view in views], first_poses, rtol=same_pose, atol=same_pose):
+        return views
+    return [view._replace(pose=pose) for view, pose in zip(views, poses, strict=True)]

@@ -1,4 +1,8 @@
-"""List the views of OpenSfM, Polycam and WorldMirror, which write the values of a view into several lists or files."""
+"""Read the views of programs whose files no :class:`ViewLayout` alone describes.
+
+OpenSfM, Polycam and WorldMirror write the values of a view into several lists or files. Long-LRM moves its cameras, and
+SHARP writes its camera into the elements of its ``.ply``.
+"""
 
 from __future__ import annotations
 
@@ -8,11 +12,24 @@ from typing import Any
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.io.bounds import read_json
-from gsmerge.io.cameras.camera_file import CENTRED_PX, MAX_NORMALISED_FOCAL, MAX_NUMBER, StoredView, check_camera_count
-from gsmerge.io.cameras.camera_source import CameraSource, number_errors
+from gsmerge.geometry.transforms import mean_pose_frame
+from gsmerge.io.bounds import MAX_VIEWS, read_json, read_text
+from gsmerge.io.cameras.camera_file import (
+    CENTRED_PX,
+    MAX_NORMALISED_FOCAL,
+    MAX_NUMBER,
+    StoredView,
+    check_camera_count,
+    make_pinhole,
+)
+from gsmerge.io.cameras.camera_source import CameraSource, StoredCameras, number_errors
 from gsmerge.io.cameras.view_layout import Entry
+from gsmerge.io.formats.table import PLY, find_format
 from gsmerge.io.image_names import natural_key, natural_order
+
+FRAMES_FILE = "input_frame_idx.txt"  # of Long-LRM; lists the frames that the model saw
+SHARP = "SHARP"  # ``source`` of the camera in SHARP's ``.ply``
+_SHARP_ELEMENTS = ("extrinsic", "intrinsic", "image_size")  # SHARP's first versions do not write image_size
 
 
 def list_shots(source: CameraSource) -> list[Entry]:
@@ -76,3 +93,72 @@ def set_centred_size(source: CameraSource, views: list[StoredView]) -> list[Stor
         return views
     size = int(first_size[0, 0]), int(first_size[0, 1])
     return [view._replace(size=size) for view in views]
+
+
+def is_long_lrm(source: CameraSource) -> bool:
+    """Return whether a JSON file has ``frames`` with ``w2c``, which only Long-LRM writes."""
+    frames = source.object.get("frames")
+    return bool(frames) and isinstance(frames, list) and all(isinstance(f, dict) and "w2c" in f for f in frames)
+
+
+def move_to_gaussians(source: CameraSource, views: list[StoredView]) -> list[StoredView]:
+    """Select the views that Long-LRM saw, and move them into the Gaussians' world: the frame of the views' mean pose.
+
+    ``input_frame_idx.txt``, in the folder of the Gaussians or in that of the cameras, lists the views that the model
+    saw. Without this file, all views are returned unchanged. Raise SceneError if the file has wrong numbers, or lists a
+    frame that does not exist.
+    """
+    folder = source.path.parent
+    if source.folder is not None and not (folder / FRAMES_FILE).is_file():
+        folder = source.folder
+    path = folder / FRAMES_FILE
+    words = read_text(path).replace(",", " ").split(maxsplit=MAX_VIEWS) if path.is_file() else []
+    if len(words) > MAX_VIEWS:
+        raise SceneError(path, f"expected at most {MAX_VIEWS} numbers, found more")
+    with number_errors(path, "expected numbers"):
+        ids = [round(float(word)) for word in words]
+    outside = next((i for i in ids if not 0 <= i < len(views)), None)
+    if outside is not None:
+        raise SceneError(path, f"expected frames 0 to {len(views) - 1}, found {outside:.6g}")
+    if not ids:
+        return views
+    selected = [views[i] for i in ids]
+    poses = np.array([view.pose for view in selected]).reshape(-1, 4, 4)
+    with np.errstate(all="ignore"):  # the check of the cameras refuses overflows
+        poses = mean_pose_frame(poses).move_viewmats(poses)
+    return [view._replace(pose=pose) for view, pose in zip(selected, poses, strict=True)]
+
+
+def read_sharp(source: CameraSource) -> StoredCameras | None:
+    """Read the camera that SHARP writes into a ``.ply``; None if the ``.ply`` has no such camera.
+
+    The width and height of the view are those of SHARP's grid of Gaussians. The grid is square, because SHARP stretches
+    photos of any shape to a square. Raise SceneError if the numbers of the camera are damaged.
+    """
+    if find_format(source.path).read is not PLY.read:
+        return None
+    elements = source.ply
+    present = [name for name in _SHARP_ELEMENTS if name in elements]
+    if "vertex" not in elements or not {"extrinsic", "intrinsic"}.issubset(present):
+        return None
+    for element in (elements[name] for name in present):
+        if element.count > 16 or len(element.columns) != 1 or element.has_lists:
+            return None
+    with np.errstate(all="ignore"):  # the check of all cameras refuses NaN
+        numbers = {name: np.asarray([row[0] for row in elements[name].rows[:]], np.float64) for name in present}
+    extrinsic, intrinsic, size = numbers["extrinsic"], numbers["intrinsic"], numbers.get("image_size", np.zeros(0))
+    if len(intrinsic) == 4 and "image_size" not in numbers:  # first versions write focal lengths and size
+        focal_lengths, size = intrinsic[:2], intrinsic[2:]
+        intrinsic = make_pinhole(*focal_lengths, *(size / 2)).reshape(-1)
+    sharp_layers = 2  # Gaussians in each cell of the grid, of a front and a back layer
+    side = round((elements["vertex"].count / sharp_layers) ** 0.5)
+    if sharp_layers * side * side != elements["vertex"].count or len(size) != 2 or not (size > 0).all():
+        return None
+    if len(extrinsic) not in (12, 16) or len(intrinsic) != 9:
+        problem = f"expected 16 and 9 numbers of a camera, found {len(extrinsic)} and {len(intrinsic)}"
+        raise SceneError(source.path, problem)
+    pose, K = extrinsic.reshape(-1, 4).copy(), intrinsic.reshape(3, 3)
+    if len(extrinsic) == 12:  # first versions write the rotation column by column
+        pose[:, :3] = pose[:, :3].T.copy()
+    K = K * np.array([[side / size[0]], [side / size[1]], [1.0]])
+    return StoredCameras([StoredView(source.path.stem, pose, K, (side, side))])

@@ -94,23 +94,7 @@ def read_cameras(path: StrPath, *, folder: Path | None = None) -> CameraFile:
         >>> len(cameras), cameras.source
         (5, 'transforms.json')
     """
-    path = _resolve(Path(path))
-    ending = "" if path.is_dir() else path.suffix.lower()
-    source = CameraSource(path, folder)
-    format_ = next((row for row in CAMERA_FORMATS if row.ending == ending and row.recognise(source)), None)
-    if format_ is None:
-        if ending == ".json" and isinstance(source.json, list):
-            check_objects(path, source.json)
-        raise SceneError(path, *_UNKNOWN.get(ending, _UNKNOWN[""]))
-    return format_.cameras(source)
-
-
-def _resolve(path: Path) -> Path:
-    """Return the camera file to which a path leads, or the folder of the cameras if they are in several files.
-
-    For a folder, return the camera file in it. For a file of a COLMAP model or of Polycam's keyframes, return its
-    folder. Raise SceneError if there are no cameras.
-    """
+    path = Path(path)
     if not os.path.exists(path):
         raise SceneError(path, "no such file or folder")
     if path.is_dir() and not _is_camera_folder(path):
@@ -119,18 +103,25 @@ def _resolve(path: Path) -> Path:
             check_program(path)
             raise SceneError(path, "expected transforms.json, cameras.json, a COLMAP model or results.npz, found none")
         path = camera_path
-    if path.is_dir():
-        return path
-    check_program(path)
-    check_file(path)
-    if path.suffix == ".json":
-        is_keyframe = is_keyframes(path.parent) and KEYFRAME in CameraSource(path).object
-        return path.parent if is_keyframe else path
-    if path.suffix not in (".bin", ".txt") or path.stem not in ("cameras", "images", "points3D"):
-        return path
-    if not is_colmap(path.parent):
-        raise SceneError(path, "expected a COLMAP model with cameras and images files, found no pair of them")
-    return path.parent
+    if not path.is_dir():
+        check_program(path)
+        check_file(path)
+        # A file of a COLMAP model or of Polycam's keyframes stands for its folder
+        if path.suffix == ".json":
+            is_keyframe = is_keyframes(path.parent) and KEYFRAME in CameraSource(path).object
+            path = path.parent if is_keyframe else path
+        elif path.suffix in (".bin", ".txt") and path.stem in ("cameras", "images", "points3D"):
+            if not is_colmap(path.parent):
+                raise SceneError(path, "expected a COLMAP model with cameras and images files, found no pair of them")
+            path = path.parent
+    ending = "" if path.is_dir() else path.suffix.lower()
+    source = CameraSource(path, folder)
+    format_ = next((row for row in CAMERA_FORMATS if row.ending == ending and row.recognise(source)), None)
+    if format_ is None:
+        if ending == ".json" and isinstance(source.json, list):
+            check_objects(path, source.json)
+        raise SceneError(path, *_UNKNOWN.get(ending, _UNKNOWN[""]))
+    return format_.cameras(source)
 
 
 def read_sharp_camera(path: Path) -> CameraFile | None:

@@ -44,13 +44,18 @@ def read_views(source: CameraSource, layout: ViewLayout) -> StoredCameras:
         check_objects(source.path, stored, place)
         check_camera_count(source.path, len(stored))
         entries = [Entry(view, source.object) for view in stored]
+    # Keys of intrinsics, size and lens that must have a value in each view, or in the object that views share
+    required_keys = [key for name, key in layout.number_keys.items() if not name.startswith("angle")]
+    required_keys += [layout.K.key] if isinstance(layout.K, Matrix) else []
+    required_keys += [key for key in (layout.size, layout.lens) if isinstance(key, str) and key]
+    required_keys = [key for key in required_keys if key not in layout.optional]
     shared: dict[int, dict[str, Any]] = {}  # id of an object that views share -> its values, converted only once
     cameras: list[tuple[Path, str, np.ndarray, dict[str, Any]]] = []
     for i, entry in enumerate(entries):
         names = (entry.values[key] for key in _alternatives(layout.name) if entry.values.get(key) not in (None, ""))
         path, name = entry.path or source.path, entry.name or str(next(names, f"view {i}"))
         missing: list[Key] = [key for key in layout.pose.keys if entry.values.get(key) is None]
-        for key in layout.required_keys:
+        for key in required_keys:
             if _find_value(entry.values, key) is None and _find_value(entry.shared, key) is None:
                 missing.append(key)
         if missing:
@@ -68,10 +73,10 @@ def read_views(source: CameraSource, layout: ViewLayout) -> StoredCameras:
     for path, name, pose, values in cameras:
         with number_errors(path, f"view {name}: expected numbers"):
             lens = _lens(path, name, values) if layout.lens else None
-            if has_intrinsics and "K" not in values:
-                values = _with_size(path, name, layout, values, size_of)
+            K = None
+            if has_intrinsics:
+                K, values = _intrinsics(path, name, layout, values, size_of)
             size = round(values.get("w", 0)), round(values.get("h", 0))
-            K = _intrinsics(path, name, layout, values) if has_intrinsics else None
             views.append(StoredView(name, pose, K, size, lens, values.get("mask", "")))
     return StoredCameras(views if layout.finish is None else layout.finish(source, views))
 
@@ -126,13 +131,21 @@ def _two_numbers(values: Any) -> tuple[float, float]:
     return to_number(values[0]), to_number(values[1])
 
 
-def _with_size(
+def _intrinsics(
     path: Path, name: str, layout: ViewLayout, values: dict[str, Any], size_of: Callable[[Path], Size]
-) -> dict[str, Any]:
-    """Return the values of a view. If the intrinsics need a size and the file has no size, read the image's.
+) -> tuple[np.ndarray, dict[str, Any]]:
+    """Return the intrinsics ``[3,3]`` of a view, converted to pixels from the unit and origin of the layout.
 
-    ``size_of`` returns the size of an image. Raise SceneError if the intrinsics or the image are missing.
+    If the intrinsics need a size and the file has no size, the image's size is read by ``size_of``. Also return the
+    values of the view with this size. Raise SceneError if the intrinsics or the image are missing.
     """
+    if isinstance(layout.K, Matrix):
+        K = values["K"]
+        if K.shape != (3, 3):
+            problem = f"expected 3x3 numbers in {layout.K.key!r}, found shape {K.shape}"
+            raise SceneError(path, f"view {name}: {problem}")
+        sides = [[round(values.get("w", 0.0))], [round(values.get("h", 0.0))], [1]]
+        return (K * np.array(sides) if layout.unit == "size" else K), values
     keys = layout.number_keys
     if not any(key in values for key in _FOCAL):
         missing = ", ".join(str(keys[field]) for field in ("fx", "w", "h") if field not in values)
@@ -140,24 +153,13 @@ def _with_size(
         problem = f"view {name}: expected intrinsics ({expected}), found none of {missing}"
         raise SceneError(path, problem, "add them in pixels, for all views or for each")
     has_size = values.get("w") and values.get("h")
-    if has_size or {"fx", "cx", "cy"} <= values.keys() or keys.get("w") not in layout.optional:
-        return values
-    w, h = repr(keys["w"]), repr(keys["h"])
-    image = find_image(path.parent, name, path, remedy=f"add {w} and {h} to the camera file")
-    if image is None:
-        raise SceneError(path, f"view {name}: expected {w} and {h}, found neither them nor the image itself")
-    return values | dict(zip(("w", "h"), size_of(image), strict=True))
-
-
-def _intrinsics(path: Path, name: str, layout: ViewLayout, values: Mapping[str, Any]) -> np.ndarray:
-    """Return the intrinsics ``[3,3]`` of a view, converted to pixels from the unit and origin of the layout."""
+    if not has_size and not {"fx", "cx", "cy"} <= values.keys() and keys.get("w") in layout.optional:
+        w, h = repr(keys["w"]), repr(keys["h"])
+        image = find_image(path.parent, name, path, remedy=f"add {w} and {h} to the camera file")
+        if image is None:
+            raise SceneError(path, f"view {name}: expected {w} and {h}, found neither them nor the image itself")
+        values = values | dict(zip(("w", "h"), size_of(image), strict=True))
     width, height = values.get("w", 0.0), values.get("h", 0.0)
-    if isinstance(layout.K, Matrix):
-        K = values["K"]
-        if K.shape != (3, 3):
-            problem = f"expected 3x3 numbers in {layout.K.key!r}, found shape {K.shape}"
-            raise SceneError(path, f"view {name}: {problem}")
-        return K * np.array([[round(width)], [round(height)], [1]]) if layout.unit == "size" else K
     unit = max(width, height) if layout.unit == "larger side" else 1.0  # pixels
     fx, fy = _focal(values, "x", width), _focal(values, "y", height)
     fx = fx or fy if layout.K.fx in layout.optional else fx
@@ -166,7 +168,7 @@ def _intrinsics(path: Path, name: str, layout: ViewLayout, values: Mapping[str, 
         cx, cy = (side / 2 + unit * values.get(key, 0.0) for key, side in (("cx", width), ("cy", height)))
     else:
         cx, cy = values.get("cx", width / 2), values.get("cy", height / 2)
-    return make_pinhole(unit * fx, unit * fy, cx, cy)
+    return make_pinhole(unit * fx, unit * fy, cx, cy), values
 
 
 def _focal(values: Mapping[str, float], axis: str, side: float) -> float:

@@ -12,9 +12,16 @@ from pathlib import Path
 
 from gsmerge.io.cameras.camera_file import C2W_OPENCV, C2W_OPENGL, W2C_OPENCV, CameraFile, Convention, make_camera_file
 from gsmerge.io.cameras.camera_source import CameraSource, StoredCameras
-from gsmerge.io.cameras.embedded import SHARP, read_sharp
-from gsmerge.io.cameras.long_lrm import is_long_lrm, move_to_gaussians
-from gsmerge.io.cameras.programs import join_matrices, list_keyframes, list_shots, set_centred_size
+from gsmerge.io.cameras.programs import (
+    SHARP,
+    is_long_lrm,
+    join_matrices,
+    list_keyframes,
+    list_shots,
+    move_to_gaussians,
+    read_sharp,
+    set_centred_size,
+)
 from gsmerge.io.cameras.read_views import read_views
 from gsmerge.io.cameras.view_layout import Matrix, PinholeKeys, RotationAndShift, ViewLayout, rotation_of_vector
 from gsmerge.io.first_bytes import read_start
@@ -96,7 +103,7 @@ _INRIA = ViewLayout(
     K=PinholeKeys("fx", "fy", "cx", "cy"),
     size=("width", "height"),
     optional=("cx", "cy"),
-    finish=_lazy("instantsplat.take_optimised_poses"),
+    finish=_lazy("npz_files.take_optimised_poses"),
 )
 _GLOBALSPLAT = ViewLayout(
     views="views", name=("file", "image"), pose=Matrix("c2w", (4, 4)), K=Matrix("intrinsic", (3, 3)), size="image_shape"

@@ -163,11 +163,3 @@ class ViewLayout:
         keys: dict[str, Key] = dict(vars(self.K)) if isinstance(self.K, PinholeKeys) else {}
         keys |= dict(zip(("w", "h"), self.size, strict=True)) if isinstance(self.size, tuple) else {}
         return {name: key for name, key in keys.items() if key}
-
-    @property
-    def required_keys(self) -> list[Key]:
-        """Keys of intrinsics, size and lens that must have a value in each view, or in the object that views share."""
-        keys = [key for name, key in self.number_keys.items() if not name.startswith("angle")]
-        keys += [self.K.key] if isinstance(self.K, Matrix) else []
-        keys += [key for key in (self.size, self.lens) if isinstance(key, str) and key]
-        return [key for key in keys if key not in self.optional]

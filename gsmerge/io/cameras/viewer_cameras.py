@@ -40,21 +40,17 @@ def viewer_cameras(cameras: Cameras, names: Sequence[str]) -> str:
     :func:`gsmerge.read_cameras` reads this file. Viewers assume that the principal point is in the middle. A principal
     point elsewhere is written as ``cx`` and ``cy``, which viewers ignore.
     """
-
-    def principal_point(K: np.ndarray) -> dict[str, float]:
-        """Return the entries ``cx`` and ``cy`` of a principal point; no entries if it is in the middle of the image."""
-        centred = np.allclose(2 * K[:2, 2], (cameras.width, cameras.height), rtol=0, atol=CENTRED_PX)
-        return {} if centred else {"cx": float(K[0, 2]), "cy": float(K[1, 2])}
-
     rotations, centres = cameras.viewmats[:, :3, :3].transpose(0, 2, 1), cameras.centres
-    entries = [
-        {
+    entries = list[dict[str, Any]]()
+    for i, name in enumerate(names):
+        K = cameras.Ks[i]
+        entries.append({
             "id": i, "img_name": name, "width": cameras.width, "height": cameras.height,
             "position": centres[i].tolist(), "rotation": rotations[i].tolist(),
-            "fy": float(cameras.Ks[i, 1, 1]), "fx": float(cameras.Ks[i, 0, 0]), **principal_point(cameras.Ks[i]),
-        }
-        for i, name in enumerate(names)
-    ]  # fmt: skip
+            "fy": float(K[1, 1]), "fx": float(K[0, 0]),
+        })  # fmt: skip
+        if not np.allclose(2 * K[:2, 2], (cameras.width, cameras.height), rtol=0, atol=CENTRED_PX):
+            entries[-1] |= {"cx": float(K[0, 2]), "cy": float(K[1, 2])}
     return json.dumps(entries) + "\n"
 
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from gsmerge.errors import Doubt, SceneError
 from gsmerge.io.cameras.camera_file import CameraFile, select_views, sizes_of
-from gsmerge.io.cameras.embedded import SHARP
+from gsmerge.io.cameras.programs import SHARP
 from gsmerge.io.cameras.read_cameras import read_cameras
 from gsmerge.io.cameras.table import FFGS
 from gsmerge.io.first_bytes import CONVERT
