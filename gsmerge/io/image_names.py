@@ -128,16 +128,16 @@ def match_masks(
     SceneError if a view has two masks, or if no view has a mask and ``named`` is True, which means that the user named
     the folder; the error names the ``option``.
     """
-
-    def is_of_neighbour(mask: Path, photo: Path) -> bool:
-        """Return whether the sub-folder of a mask has the name of a folder beside the folder of the photo."""
-        neighbour = photo.parent.parent / mask.parent.name
-        return mask.parent != folder and neighbour != photo.parent and neighbour.is_dir()
-
     files = list_images(folder)
     by_ending = _files_by_ending(folder, files)
-    pairs = ((_find_only(folder, by_ending, name, option), Path(name)) for name in names)
-    masks = [None if mask is None or is_of_neighbour(mask, photo) else mask for mask, photo in pairs]
+    masks = list[Path | None]()
+    for name in names:
+        mask, photo = _find_only(folder, by_ending, name, option), Path(name)
+        # If a mask's sub-folder has the name of a folder beside the photo's folder, the mask is that of another photo
+        if mask is not None and mask.parent != folder:
+            neighbour = photo.parent.parent / mask.parent.name
+            mask = None if neighbour != photo.parent and neighbour.is_dir() else mask
+        masks.append(mask)
     if not any(masks):
         unread = None if files else _describe_unread_files(walk_files(folder))
         content, remedy = unread or ("none", f"rename the masks, or name another folder with {option}")

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from gsmerge.errors import SceneError
-from gsmerge.io.bounds import ReadBudget, parse_json, read_budget, read_errors
+from gsmerge.io.bounds import parse_json, read_budget, read_errors
 from gsmerge.io.locks import lock_file
 
 LOCK = ".gsmerge-lock"  # name of the lock file that is beside a file while a line is appended
@@ -32,16 +32,11 @@ def each_line(path: Path, start: int = 0) -> Iterator[tuple[int, dict[str, Any] 
         for line in file:
             if line.endswith(b"\n"):
                 end += len(line)
-                yield end, _parse(line, budget)
-
-
-def _parse(line: bytes, budget: ReadBudget) -> dict[str, Any] | None:
-    """Return the JSON object of a line; None if the line is damaged."""
-    try:
-        value = parse_json(line.decode("utf-8"), budget)
-    except (ValueError, SceneError):
-        return None
-    return value if isinstance(value, dict) else None
+                try:
+                    value = parse_json(line.decode("utf-8"), budget)
+                except (ValueError, SceneError):
+                    value = None
+                yield end, value if isinstance(value, dict) else None
 
 
 def append_line(path: Path, value: Mapping[str, Any]) -> None:
@@ -54,7 +49,10 @@ def append_line(path: Path, value: Mapping[str, Any]) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with lock_file(path.parent / LOCK), FileIO(path, "a+b") as file:
-            end = _end_of_lines(file)
+            end = file.seek(0, os.SEEK_END)
+            if end > 0:
+                with mmap.mmap(file.fileno(), end, access=mmap.ACCESS_READ) as data:
+                    end = data.rfind(b"\n") + 1  # after the last complete line
             file.truncate(end)
             if file.write(line) != len(line):  # a full disk stores the first part without an error
                 file.truncate(end)
@@ -62,12 +60,3 @@ def append_line(path: Path, value: Mapping[str, Any]) -> None:
             os.fsync(file.fileno())
     except OSError as error:
         raise SceneError(path, f"cannot be written ({error.strerror})", "name another folder with --output") from error
-
-
-def _end_of_lines(file: FileIO) -> int:
-    """Return the position in bytes after the last complete line."""
-    size = file.seek(0, os.SEEK_END)
-    if size == 0:
-        return 0
-    with mmap.mmap(file.fileno(), size, access=mmap.ACCESS_READ) as data:
-        return data.rfind(b"\n") + 1

@@ -47,7 +47,16 @@ def packed_rows(path: Path, elements: Mapping[str, Element]) -> arrays.PackedRow
     if chunk.count < num_chunks:
         problem = f"expected {num_chunks} chunks for {count} Gaussians, found {chunk.count}"
         raise SceneError(path, problem, "export it again")
-    num_rest, ranges = _num_rest(path, elements, count), chunk.rows[:]
+    num_rest = 0  # columns of harmonics above degree 0
+    if "sh" in elements:
+        row_type = elements["sh"].rows.dtype
+        names = {name for name in row_type.names or () if row_type[name] == np.uint8}
+        num_rest = len(names)
+        are_whole_degrees = num_rest in (9, 24, 45) and names == {f"f_rest_{i}" for i in range(num_rest)}
+        if not are_whole_degrees or elements["sh"].count != count:
+            problem = f"expected 9, 24 or 45 harmonics of {count} Gaussians in element 'sh', found others"
+            raise SceneError(path, problem, "export it again")
+    ranges = chunk.rows[:]
 
     def unpack(block: slice) -> arrays.Columns:
         """Unpack a block of Gaussians."""
@@ -88,23 +97,6 @@ def _unpack(vertex: np.ndarray, chunk: np.ndarray, codes: np.ndarray, block: sli
         sh0=rgb_to_sh0(_interpolate(colors, chunk, COLOR_RANGES, chunk_ids)),
         harmonics=_HARMONICS[codes.reshape(len(vertex), 3, -1).transpose(0, 2, 1)],
     )
-
-
-def _num_rest(path: Path, elements: Mapping[str, Element], count: int) -> int:
-    """Count the columns of harmonics above degree 0; raise SceneError unless they make up degree 0, 1, 2 or 3."""
-    if "sh" not in elements:
-        return 0
-    row_type = elements["sh"].rows.dtype
-    names = {name for name in row_type.names or () if row_type[name] == np.uint8}
-    num_rest = len(names)
-    if (
-        num_rest not in (9, 24, 45)
-        or names != {f"f_rest_{i}" for i in range(num_rest)}
-        or elements["sh"].count != count
-    ):
-        problem = f"expected 9, 24 or 45 harmonics of {count} Gaussians in element 'sh', found others"
-        raise SceneError(path, problem, "export it again")
-    return num_rest
 
 
 def _interpolate(

@@ -95,15 +95,27 @@ def glb_bytes(
     num_higher = (min(MAX_DEGREE, gaussians.sh_degree) + 1) ** 2 - 1
     half_turn = rotator(np.diag([-1.0, -1.0, 1.0]), num_higher)  # from y down to y up
     blocks = [_attributes(half_turn(columns)) for _, columns in column_blocks(gaussians, MAX_DEGREE)]
-    attributes = {name: _join([block.pop(name) for block in blocks]) for name in tuple(blocks[0])}
-    views, accessors = _describe_arrays(list(attributes.values()))
-    for name, bound in (("min", np.min), ("max", np.max)):  # glTF asks for the bounds of positions
-        accessors[0][name] = bound(attributes["POSITION"], axis=0).tolist()
-    # The array of an attribute may be a view of a wider array with padded rows, which is then written
-    content = b"".join((array if array.base is None else array.base).tobytes() for array in attributes.values())
+    # The arrays of all attributes follow each other in one buffer
+    names, content, offset = tuple(blocks[0]), list[bytes](), 0
+    views, accessors = list[dict[str, Any]](), list[dict[str, Any]]()
+    for view_id, name in enumerate(names):
+        parts = [block.pop(name) for block in blocks]
+        # An array may be a view of a wider array with padded rows, which is then written
+        array, width = np.concatenate([part if part.base is None else part.base for part in parts]), parts[0].shape[1]
+        row_bytes = array.strides[0]
+        size = len(array) * row_bytes
+        stride = {"byteStride": 4} if row_bytes == 4 and width == 1 else {}  # rows of two bytes are padded to four
+        views.append({"buffer": 0, "byteOffset": offset, "byteLength": size, **stride, "target": _VERTICES})
+        component: dict[str, Any] = {"componentType": _COMPONENTS[array.dtype.str]}
+        component |= {} if array.dtype.kind == "f" else {"normalized": True}
+        accessors.append({"bufferView": view_id, **component, "count": len(array), "type": _TYPE_NAMES[width]})
+        if name == "POSITION":  # glTF asks for the bounds of positions
+            accessors[-1] |= {"min": array.min(axis=0).tolist(), "max": array.max(axis=0).tolist()}
+        content.append(array.tobytes())
+        offset += size
     splats = {"kernel": "ellipse", "colorSpace": COLOR_SPACE}
     splats |= {"sortingMethod": "cameraDistance", "projection": "perspective"}
-    accessor_ids = {name: i for i, name in enumerate(attributes)}
+    accessor_ids = {name: i for i, name in enumerate(names)}
     document = {
         "extensionsUsed": [NAME],
         "nodes": [{"mesh": 0}, *nodes],
@@ -112,7 +124,7 @@ def glb_bytes(
         "accessors": accessors,
         "bufferViews": views,
     }
-    return pack_glb(document, content)
+    return pack_glb(document, b"".join(content))
 
 
 def pack_glb(document: dict[str, Any], content: bytes) -> bytes:
@@ -127,26 +139,6 @@ def pack_glb(document: dict[str, Any], content: bytes) -> bytes:
     text = json.dumps(document, separators=(",", ":")).encode("ascii")
     chunks = _chunk(b"JSON", text, b" ") + _chunk(b"BIN\0", content, b"\0")
     return _FILE_HEAD.pack(b"glTF", 2, _FILE_HEAD.size + len(chunks)) + chunks
-
-
-def _join(blocks: Sequence[np.ndarray]) -> np.ndarray:
-    """Join blocks ``[n,width]`` of rows. If the blocks are views of padded rows, so is the result."""
-    return np.concatenate([block if block.base is None else block.base for block in blocks])[:, : blocks[0].shape[1]]
-
-
-def _describe_arrays(arrays: Sequence[np.ndarray]) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Return glTF's lists of buffer views and accessors for arrays ``[n,width]`` that follow each other in a buffer."""
-    views, accessors, offset = list[dict[str, Any]](), list[dict[str, Any]](), 0
-    for view_id, array in enumerate(arrays):
-        row_bytes, width = array.strides[0], array.shape[1]
-        size = len(array) * row_bytes
-        stride = {"byteStride": 4} if row_bytes == 4 and width == 1 else {}  # rows of two bytes are padded to four
-        views.append({"buffer": 0, "byteOffset": offset, "byteLength": size, **stride, "target": _VERTICES})
-        component: dict[str, Any] = {"componentType": _COMPONENTS[array.dtype.str]}
-        component |= {} if array.dtype.kind == "f" else {"normalized": True}
-        accessors.append({"bufferView": view_id, **component, "count": len(array), "type": _TYPE_NAMES[width]})
-        offset += size
-    return views, accessors
 
 
 def _attributes(columns: Columns) -> dict[str, np.ndarray]:
@@ -314,41 +306,20 @@ def _walk_splats(document: dict[str, Any], budget: ReadBudget) -> Iterator[tuple
             raise _ForeignError(f"one with two parents of node {node_id}")
         visited.add(node_id)
         node = nodes[node_id]
-        transform = parent_transform if _MOVING_KEYS.isdisjoint(node) else matmul(parent_transform, _node_matrix(node))
+        transform = parent_transform
+        if not _MOVING_KEYS.isdisjoint(node):
+            matrix = np.eye(4)
+            if "matrix" in node:
+                matrix = np.ascontiguousarray(np.array(node["matrix"], np.float64).reshape(4, 4).T)
+            else:
+                x, y, z, w = node.get("rotation", (0, 0, 0, 1))
+                rotation = quat_to_rotmat(np.array([[w, x, y, z]], np.float64))[0]
+                matrix[:3, :3] = rotation * np.array(node.get("scale", (1, 1, 1)))
+                matrix[:3, 3] = node.get("translation", (0, 0, 0))
+            transform = matmul(parent_transform, matrix)
         primitives = document["meshes"][node["mesh"]]["primitives"] if "mesh" in node else []
         yield from ((primitive, transform) for primitive in primitives if NAME in primitive.get("extensions", {}))
         stack += [(child, transform) for child in reversed(node.get("children", []))]
-
-
-def _node_matrix(node: dict[str, Any]) -> np.ndarray:
-    """Return the matrix ``[4,4]`` by which a node transforms its mesh and its children."""
-    if "matrix" in node:
-        return np.ascontiguousarray(np.array(node["matrix"], np.float64).reshape(4, 4).T)
-    x, y, z, w = node.get("rotation", (0, 0, 0, 1))
-    matrix = np.eye(4)
-    matrix[:3, :3] = quat_to_rotmat(np.array([[w, x, y, z]], np.float64))[0] * np.array(node.get("scale", (1, 1, 1)))
-    matrix[:3, 3] = node.get("translation", (0, 0, 0))
-    return matrix
-
-
-@dataclass(frozen=True)
-class _Attributes:
-    """The attributes of a primitive. Reading an attribute adds the number of its bytes to ``sizes``."""
-
-    content: _Content
-    ids: dict[str, Any]  # of accessors, by name of the attribute
-    sizes: dict[str, int]  # attribute of Gaussians -> bytes
-
-    def read(self, kind: str, width: int, name: str) -> _Values:
-        """Read the glTF attribute ``name`` with ``width`` numbers per Gaussian; add its bytes to ``sizes[kind]``."""
-        if name not in self.ids:
-            raise _ForeignError(f"one whose Gaussians have no {name}")
-        bytes_before = self.content.num_read
-        values = self.content.read_values(self.ids[name])
-        if values.stored.shape[1] != width:
-            raise _ForeignError(f"one with {values.stored.shape[1]} numbers of {name} per Gaussian")
-        self.sizes[kind] = self.sizes.get(kind, 0) + self.content.num_read - bytes_before
-        return values
 
 
 def _read_splats(
@@ -368,11 +339,23 @@ def _read_splats(
     kind = splats.get("kernel", "ellipse"), splats.get("colorSpace", COLOR_SPACE)
     if splats.get("extensions") or kind != ("ellipse", COLOR_SPACE):
         raise _ForeignError(f"Gaussians of another kind ({', '.join(map(str, splats.get('extensions') or kind))})")
-    attributes = _Attributes(content, primitive.get("attributes", {}), sizes)
-    means, scales = attributes.read("means", 3, "POSITION"), attributes.read("scales", 3, f"{NAME}:SCALE")
-    quats, opacities = attributes.read("quats", 4, f"{NAME}:ROTATION"), attributes.read("opacities", 1, _OPACITY)
-    degree = max((degree for degree in range(MAX_DEGREE + 1) if HARMONICS[degree**2] in attributes.ids), default=0)
-    sh0, *harmonics = (attributes.read("shN" if i else "sh0", 3, HARMONICS[i]) for i in range((degree + 1) ** 2))
+    ids = primitive.get("attributes", {})  # of accessors, by name of the attribute
+
+    def read(kind: str, width: int, name: str) -> _Values:
+        """Read the glTF attribute ``name`` with ``width`` numbers per Gaussian; add its bytes to ``sizes[kind]``."""
+        if name not in ids:
+            raise _ForeignError(f"one whose Gaussians have no {name}")
+        bytes_before = content.num_read
+        values = content.read_values(ids[name])
+        if values.stored.shape[1] != width:
+            raise _ForeignError(f"one with {values.stored.shape[1]} numbers of {name} per Gaussian")
+        sizes[kind] = sizes.get(kind, 0) + content.num_read - bytes_before
+        return values
+
+    means, scales = read("means", 3, "POSITION"), read("scales", 3, f"{NAME}:SCALE")
+    quats, opacities = read("quats", 4, f"{NAME}:ROTATION"), read("opacities", 1, _OPACITY)
+    degree = max((degree for degree in range(MAX_DEGREE + 1) if HARMONICS[degree**2] in ids), default=0)
+    sh0, *harmonics = (read("shN" if i else "sh0", 3, HARMONICS[i]) for i in range((degree + 1) ** 2))
     count = len(means.stored)
     if any(len(values.stored) != count for values in (quats, scales, opacities, sh0, *harmonics)):
         raise _ForeignError(f"one whose attributes do not all have {count} values, one per Gaussian")

@@ -110,9 +110,18 @@ def read_rows(path: Path) -> arrays.StoredRows:
     if arrays.SCALES[2] not in names:
         notes.append(f"2D Gaussians have two scales; the third is set to {THIN:g} of the smaller one")
         comments += (arrays.FLAT_COMMENT,)
+    layout, has_normals = f"SH degree {arrays.sh_degree(len(rest) // 3)}", set(arrays.NORMALS) <= set(names)
+    if is_compressed:
+        layout = f"compressed, {layout}"
+    elif arrays.SH0[0] not in names:
+        layout = "columns of red, green and blue"
+    elif not rest:
+        layout = "17-column export" if has_normals else "14-column export (no normals)"
+    else:
+        layout = f"INRIA, {layout}" + ("" if has_normals else " (no normals)")
     return arrays.StoredRows(
         rows=rows,
-        layout=_layout_name(names, len(rest), is_compressed=is_compressed),
+        layout=layout,
         format=header.format.replace("_", " ").replace(" endian", "-endian"),
         encoding="logit" if is_compressed or is_from_gsmerge(comments) else None,
         sizes=_bytes_by_attribute(rows.dtype, len(rows), is_compressed=is_compressed),
@@ -196,18 +205,6 @@ def _vertex_rows(path: Path, elements: Mapping[str, Element]) -> tuple[np.ndarra
     if len(rows) == 0:
         raise SceneError(path, "expected at least one Gaussian, found 0 vertices", "export it again")
     return rows, prefix
-
-
-def _layout_name(names: tuple[str, ...], num_rest: int, *, is_compressed: bool) -> str:
-    """Name the layout of a file's columns for the user."""
-    if is_compressed:
-        return f"compressed, SH degree {arrays.sh_degree(num_rest // 3)}"
-    if arrays.SH0[0] not in names:
-        return "columns of red, green and blue"
-    normals = set(arrays.NORMALS) <= set(names)
-    if num_rest == 0:
-        return "17-column export" if normals else "14-column export (no normals)"
-    return f"INRIA, SH degree {arrays.sh_degree(num_rest // 3)}" + ("" if normals else " (no normals)")
 
 
 def _bytes_by_attribute(row_type: np.dtype[np.void], count: int, *, is_compressed: bool) -> dict[str, int]:
@@ -390,52 +387,46 @@ def _parse_header(budget: ReadBudget, start: bytes) -> Header:
 def _check_sizes(budget: ReadBudget, header: Header, start: bytes) -> None:
     """Raise SceneError if a file is too short for the rows in its header, or if they are of a kind that is not read.
 
-    ``start``: the first bytes of the file.
+    An element is not read if it has no columns, a negative count, vertices with lists, or too many lists. ``start``:
+    the first bytes of the file.
     """
     path, is_text = Path(budget.path), header.format == "ascii"
     steps_per_element = 50  # steps of 20 microseconds for all readers that open the file one after another
     budget.check_steps(steps_per_element * len(header.elements), "steps for elements")
     bytes_left = budget.file_bytes - header.num_bytes
     for element in header.elements.values():
-        _check_element(budget, element)
+        name, count, num_columns = element.name, element.count, len(element.columns)
+        if count < 0:
+            problem = f"expected a number of rows, found {count} rows of element '{name}'"
+            raise SceneError(path, problem, arrays.EXPORT_AGAIN)
+        if count and not num_columns:
+            problem = f"expected columns, found element '{name}' of {count} rows without any"
+            raise SceneError(path, problem, arrays.EXPORT_AGAIN)
+        unknown = sorted({words[0] for words in element.columns.values() if len(words) == 1} - _TYPES.keys())
+        if unknown:
+            problem = f"expected columns of float or another type of PLY, found {unknown[0]!r:.40} in element '{name}'"
+            raise SceneError(path, problem, "export it again with columns of float")
+        if element.has_lists:
+            if name == "vertex":
+                problem = "expected one number per column and vertex, found a list property"
+                raise SceneError(path, problem, arrays.EXPORT_AGAIN)
+            max_lists = 1_000_000  # most lists of an element, since each list is passed over by itself
+            if count * num_columns > max_lists:
+                problem = f"expected at most {max_lists:,} lists, found element '{name}' with lists in {count:,} rows"
+                raise SceneError(path, problem, "export it without this element")
+            list_bytes = 140  # bytes of memory for each list
+            budget.check_memory(list_bytes * count * num_columns, f"lists in {count:,} rows")
         # A number in text has at least a digit and a space. A list has at least its length, whose type is the second
         # word
         types = [(words[1:2] or words)[0] for words in element.columns.values()]
-        row_bytes = sum(2 if is_text else _TYPES.get(name, _TYPES["char"]).itemsize for name in types)
-        bytes_before, bytes_left = bytes_left, bytes_left - element.count * row_bytes
+        row_bytes = sum(2 if is_text else _TYPES.get(word, _TYPES["char"]).itemsize for word in types)
+        bytes_before, bytes_left = bytes_left, bytes_left - count * row_bytes
         if bytes_left < -1:  # the last row of a text may end without a new line
-            expected = f"element '{element.name}' with {element.count} rows"
+            expected = f"element '{name}' with {count} rows"
             raise truncated(path, expected, bytes_before // row_bytes, "early end of file")
     if is_text and b"," in re.split(rb"[\r\n]", start[header.num_bytes :], maxsplit=1)[0]:
         problem = "expected numbers with decimal points and spaces between them, found commas in the first row"
         raise SceneError(path, problem, "export it again with decimal points, or as binary")
-
-
-def _check_element(budget: ReadBudget, element: Element) -> None:
-    """Raise SceneError if an element has no columns, a negative count, vertices with lists, or too many lists."""
-    path, name, count, num_columns = Path(budget.path), element.name, element.count, len(element.columns)
-    if count < 0:
-        raise SceneError(
-            path, f"expected a number of rows, found {count} rows of element '{name}'", arrays.EXPORT_AGAIN
-        )
-    if count and not num_columns:
-        raise SceneError(
-            path, f"expected columns, found element '{name}' of {count} rows without any", arrays.EXPORT_AGAIN
-        )
-    unknown = sorted({words[0] for words in element.columns.values() if len(words) == 1} - _TYPES.keys())
-    if unknown:
-        problem = f"expected columns of float or another type of PLY, found {unknown[0]!r:.40} in element '{name}'"
-        raise SceneError(path, problem, "export it again with columns of float")
-    if not element.has_lists:
-        return
-    if name == "vertex":
-        raise SceneError(path, "expected one number per column and vertex, found a list property", arrays.EXPORT_AGAIN)
-    max_lists = 1_000_000  # most lists of an element, since each list is passed over by itself
-    if count * num_columns > max_lists:
-        problem = f"expected at most {max_lists:,} lists, found element '{name}' with lists in {count:,} rows"
-        raise SceneError(path, problem, "export it without this element")
-    list_bytes = 140  # bytes of memory for each list
-    budget.check_memory(list_bytes * count * num_columns, f"lists in {count:,} rows")
 
 
 def ply_blocks(

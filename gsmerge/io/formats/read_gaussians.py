@@ -343,27 +343,22 @@ def _convert_with_numpy(rows: np.ndarray, out: dict[str, np.ndarray]) -> tuple[i
             out["sh0"][:, 0, j] = colors[:, j] if name in arrays.SH0 else rgb_to_sh0(colors[:, j] / white)
         out["shN"][:] = rest.reshape(out["shN"].shape)
         out["scales"][:], out["opacities"][:] = exp(log_scales), opacities
-        is_zero = _normalise(list(quats.T), out["quats"])
+        w, x, y, z = quats.T
+        squared_lengths = w * w + x * x + y * y + z * z
+        inverse_lengths = 1 / np.sqrt(squared_lengths)
+        for j, column in enumerate(quats.T):
+            np.multiply(column, inverse_lengths, out=out["quats"][:, j])
+        is_zero = np.zeros(len(rows), np.bool_)
+        # Quaternions whose squares under- or overflow in float32 are normalised again in float64. Zero quaternions
+        # become the identity
+        extreme = np.flatnonzero(~((squared_lengths > 1e-30) & (squared_lengths < 1e30)))
+        if len(extreme):
+            exact = quats[extreme].astype(np.float64)
+            length = np.linalg.norm(exact, axis=1)
+            is_zero[extreme] = length == 0
+            exact[length == 0] = (1, 0, 0, 0)
+            out["quats"][extreme] = exact / np.where(length == 0, 1, length)[:, None]
     return int((is_clipped & out["valid"]).sum()), int((is_zero & out["valid"]).sum())
-
-
-def _normalise(quats: list[np.ndarray], out: np.ndarray) -> np.ndarray:
-    """Write unit quaternions to ``out [n,4]``, or the identity for zero quaternions; return ``[n]`` which are zero."""
-    w, x, y, z = quats
-    squared_lengths = w * w + x * x + y * y + z * z
-    inverse_lengths = 1 / np.sqrt(squared_lengths)
-    for j, column in enumerate(quats):
-        np.multiply(column, inverse_lengths, out=out[:, j])
-    is_zero = np.zeros(len(w), np.bool_)
-    # Quaternions whose squares under- or overflow in float32 are normalised again in float64
-    extreme = np.flatnonzero(~((squared_lengths > 1e-30) & (squared_lengths < 1e30)))
-    if len(extreme):
-        exact = np.stack([column[extreme].astype(np.float64) for column in quats], 1)
-        length = np.linalg.norm(exact, axis=1)
-        is_zero[extreme] = length == 0
-        exact[length == 0] = (1, 0, 0, 0)
-        out[extreme] = exact / np.where(length == 0, 1, length)[:, None]
-    return is_zero
 
 
 def _decode_opacities(
@@ -376,7 +371,8 @@ def _decode_opacities(
     """Convert stored opacities to [0, 1], in place; return their encoding, "logit" or "raw", and whether it is a guess.
 
     For a guess, the opacities of the rows ``empty``, which only pad the file, are ignored. Rows with infinite values
-    other than logits become invalid. Raise SceneError if the values contradict the caller's choice "raw".
+    other than logits become invalid. Raise SceneError if the values contradict the caller's choice "raw", or if the
+    files have different encodings.
     """
     path, opacities, encoding, is_guess = paths[0], out["opacities"], str(choice), False
     if choice == "raw":
@@ -390,7 +386,22 @@ def _decode_opacities(
     if choice == "auto":
         values = opacities if len(empty) == 0 else opacities.copy()
         values[empty] = np.nan  # ignored below
-        declared = _declared_encoding(paths, parts, values)
+        # A file that declares no encoding, but has at least 100 values, is compared with the others by a guess
+        start, part_names, min_values = 0, dict[str, str](), 100  # encoding -> name of the first part that has it
+        for part_path, part in zip(paths, parts, strict=True):
+            part_values = values[start : start + len(part.rows)]
+            start += len(part_values)
+            part_encoding = part.encoding
+            if part_encoding is None and len(parts) > 1 and np.isfinite(part_values).sum() >= min_values:
+                part_encoding = "raw" if arrays.lie_in_unit_range(part_values) else "logit"
+            if part_encoding is not None:
+                part_names.setdefault(part_encoding, part_path.name)
+            if len(part_names) > 1:
+                (other, name), _ = part_names.items()
+                problem = f"expected {other} opacities as in {name}, found {part_encoding} opacities"
+                remedy = "export all parts alike; if all are logits, use --hint opacity=logit"
+                raise SceneError(part_path, problem, remedy)
+        declared = next((part.encoding for part in parts if part.encoding is not None), None)
         finite_values = values[np.isfinite(values)] if declared is None else values[:0]
         if len(finite_values) and finite_values.min() >= 0 and finite_values.max() <= 255:
             share = 100 * np.count_nonzero(finite_values > ply.MAX_LOGIT) / len(finite_values)
@@ -409,28 +420,6 @@ def _decode_opacities(
             np.add(opacities, 1, out=opacities)
             np.reciprocal(opacities, out=opacities)
     return encoding, is_guess
-
-
-def _declared_encoding(paths: Sequence[Path], parts: Sequence[StoredRows], opacities: np.ndarray) -> str | None:
-    """Return the encoding of opacities that one of the files declares; None if no file declares an encoding.
-
-    Raise SceneError if the files have different encodings. If a file declares no encoding, but has at least 100 values,
-    its encoding is guessed from the values for this check.
-    """
-    start, part_names = 0, dict[str, str]()  # encoding -> name of the first part that has it
-    min_values = 100  # least number of values for a guess
-    for path, part in zip(paths, parts, strict=True):
-        values = opacities[start : start + len(part.rows)]
-        start += len(values)
-        may_guess = len(parts) > 1 and np.isfinite(values).sum() >= min_values
-        encoding = part.encoding or (("raw" if arrays.lie_in_unit_range(values) else "logit") if may_guess else None)
-        if encoding is not None:
-            part_names.setdefault(encoding, path.name)
-        if len(part_names) > 1:
-            (other, name), _ = part_names.items()
-            problem = f"expected {other} opacities as in {name}, found {encoding} opacities"
-            raise SceneError(path, problem, "export all parts alike; if all are logits, use --hint opacity=logit")
-    return next((part.encoding for part in parts if part.encoding is not None), None)
 
 
 def _spread_low_degree(shN: np.ndarray) -> None:

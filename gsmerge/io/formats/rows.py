@@ -204,12 +204,10 @@ def concatenate(parts: Sequence[Columns], num_higher: int) -> Columns:
     """Concatenate rows with ``num_higher`` harmonics above degree 0; missing harmonics become zeros."""
     if len(parts) == 1 and parts[0].harmonics.shape[1] == num_higher:
         return parts[0]
-
-    def widen(harmonics: np.ndarray) -> np.ndarray:
-        """Add zeros for missing harmonics."""
-        return np.pad(harmonics, ((0, 0), (0, num_higher - harmonics.shape[1]), (0, 0)))
-
-    widened = [replace(part, harmonics=widen(part.harmonics)) for part in parts]
+    widened = [
+        replace(part, harmonics=np.pad(part.harmonics, ((0, 0), (0, num_higher - part.harmonics.shape[1]), (0, 0))))
+        for part in parts
+    ]
     return Columns(*(np.concatenate([vars(part)[f.name] for part in widened]) for f in fields(Columns)))
 
 

@@ -231,8 +231,19 @@ def _read_packed(files: _Files, meta: dict[str, Any], count: int, budget: ReadBu
     scale_codes, color_codes = (_to_numbers(meta[key]["codebook"], CODES) for key in ("scales", "sh0"))
     if quats[:, 3].min() < FIRST_MODE:
         raise ValueError(f"rotations of mode {quats[:, 3].min()}")
-    labels, palette = _read_palette(files, meta["shN"], count, budget) if meta.get("shN") else (None, np.zeros((0, 3)))
-    harmonic_codes = np.zeros(CODES) if labels is None else _to_numbers(meta["shN"]["codebook"], CODES)
+    # The entry of each Gaussian in the palette ``[n,num_higher,3]`` of codes, if there are harmonics
+    labels: np.ndarray | None = None
+    palette, harmonic_codes = np.zeros((0, 0, 3), np.uint8), np.zeros(CODES)
+    if meta.get("shN"):
+        size = check_whole(meta["shN"]["count"], "count", 1, 2**PALETTE_BITS)
+        num_higher = (meta["shN"]["bands"] + 1) ** 2 - 1
+        palette_name, labels_name = meta["shN"]["files"]
+        labels = _read_texture(files, labels_name, count, budget)[:, :2].copy().view("<u2")[:, 0]
+        # Rows of the texture; a label may exceed the size of the palette that ``meta.json`` states
+        rows = max(-(-size // PALETTE_COLUMNS), int(labels.max()) // PALETTE_COLUMNS + 1)
+        centroids = _read_texture(files, palette_name, rows * PALETTE_COLUMNS * num_higher, budget)[:, :3]
+        palette = centroids.reshape(-1, num_higher, 3)
+        harmonic_codes = _to_numbers(meta["shN"]["codebook"], CODES)
 
     def unpack(block: slice) -> arrays.Columns:
         """Return the Gaussians of a block of rows."""
@@ -247,7 +258,7 @@ def _read_packed(files: _Files, meta: dict[str, Any], count: int, budget: ReadBu
             harmonics=harmonic_codes[codes],
         )
 
-    return arrays.Packed(count, 0 if labels is None else palette.shape[1], unpack)
+    return arrays.Packed(count, palette.shape[1], unpack)
 
 
 def _to_numbers(values: Any, length: int) -> np.ndarray:
@@ -256,17 +267,6 @@ def _to_numbers(values: Any, length: int) -> np.ndarray:
     if numbers.shape != (length,):
         raise ValueError(f"{numbers.shape} numbers instead of {length}")
     return numbers
-
-
-def _read_palette(files: _Files, meta: dict[str, Any], count: int, budget: ReadBudget) -> tuple[np.ndarray, np.ndarray]:
-    """Return the index ``[count]`` of each Gaussian's entry, and the palette ``[n,num_higher,3]`` of codes."""
-    size, num_higher = check_whole(meta["count"], "count", 1, 2**PALETTE_BITS), (meta["bands"] + 1) ** 2 - 1
-    palette_name, labels_name = meta["files"]
-    labels = _read_texture(files, labels_name, count, budget)[:, :2].copy().view("<u2")[:, 0]
-    # Rows of the texture; a label may exceed the size of the palette that ``meta.json`` states
-    rows = max(-(-size // PALETTE_COLUMNS), int(labels.max()) // PALETTE_COLUMNS + 1)
-    centroids = _read_texture(files, palette_name, rows * PALETTE_COLUMNS * num_higher, budget)[:, :3]
-    return labels, centroids.reshape(-1, num_higher, 3)
 
 
 def sog_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> bytes:
@@ -309,24 +309,19 @@ def sog_files(columns: arrays.Columns, mode: str | None = None) -> dict[str, byt
     colors = np.concatenate([nearest_codes(sh0, columns.sh0), arrays.to_bytes(255 * columns.opacities)[:, None]], 1)
     add("sh0", {"sh0.webp": _encode_texture(colors)}, codebook=_shorten(sh0))
     if columns.harmonics.size:
-        files, numbers = _encode_palette(columns.harmonics)
-        add("shN", files, **numbers)
+        num_higher = columns.harmonics.shape[1]
+        palette, labels = fit_palette(columns.harmonics.reshape(count, -1), PALETTE_BITS)
+        codebook = fit_codebook(palette)
+        rows = -(-len(palette) // PALETTE_COLUMNS)
+        centroids = np.zeros((rows * PALETTE_COLUMNS, num_higher, 3), np.uint8)
+        centroids[: len(palette)] = nearest_codes(codebook, palette).reshape(-1, num_higher, 3)
+        files = {
+            "shN_centroids.webp": _encode_webp(centroids.reshape(rows, PALETTE_COLUMNS * num_higher, 3)),
+            "shN_labels.webp": _encode_texture(np.stack([labels & 255, labels >> 8, np.zeros_like(labels)], 1)),
+        }
+        bands = arrays.sh_degree(num_higher)
+        add("shN", files, count=len(palette), bands=bands, codebook=_shorten(codebook))
     return {**textures, META: json.dumps(meta).encode("ascii")}
-
-
-def _encode_palette(harmonics: np.ndarray) -> tuple[dict[str, bytes], dict[str, Any]]:
-    """Encode ``harmonics [n,num_higher,3]`` as a palette; return its textures, and its numbers for ``meta.json``."""
-    count, num_higher = harmonics.shape[:2]
-    palette, labels = fit_palette(harmonics.reshape(count, -1), PALETTE_BITS)
-    codebook = fit_codebook(palette)
-    rows = -(-len(palette) // PALETTE_COLUMNS)
-    centroids = np.zeros((rows * PALETTE_COLUMNS, num_higher, 3), np.uint8)
-    centroids[: len(palette)] = nearest_codes(codebook, palette).reshape(-1, num_higher, 3)
-    files = {
-        "shN_centroids.webp": _encode_webp(centroids.reshape(rows, PALETTE_COLUMNS * num_higher, 3)),
-        "shN_labels.webp": _encode_texture(np.stack([labels & 255, labels >> 8, np.zeros_like(labels)], 1)),
-    }
-    return files, {"count": len(palette), "bands": arrays.sh_degree(num_higher), "codebook": _shorten(codebook)}
 
 
 def round_means(means: np.ndarray) -> np.ndarray:

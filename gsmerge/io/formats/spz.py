@@ -196,12 +196,28 @@ def _gzip_parts(
 def _zstandard_parts(
     budget: ReadBudget, packed: bytes, before: Sequence[arrays.Packed]
 ) -> tuple[Header, list[np.ndarray], bytes, int]:
-    """Read version 4, with a stream per column; return the same as :func:`_gzip_parts`."""
+    """Read version 4, with a stream per column; return the same as :func:`_gzip_parts`.
+
+    Raise SceneError if the table contradicts the header, or if the file is too short for the table.
+    """
     import zstandard  # few files need it
 
     path, header = budget.path, _read_header(budget, packed, packed[: HEADER.size], (4,), before)
     sizes = [header.count * width for width in header.widths if width]
-    table_start, ends = _read_table(path, packed, header, sizes)
+    try:
+        (table_start,) = TABLE_START.unpack_from(packed, HEADER.size)
+        table = [TABLE_ROW.unpack_from(packed, table_start + i * TABLE_ROW.size) for i in range(header.num_streams)]
+    except struct.error as error:
+        raise SceneError(path, FOUND_EARLY_END, arrays.EXPORT_AGAIN) from error
+    if [unpacked_size for _, unpacked_size in table] != sizes:
+        problem = f"damaged: expected columns of {sizes} bytes for {header.count} Gaussians, found others"
+        raise SceneError(path, problem, arrays.EXPORT_AGAIN)
+    # The start of each stream, followed by the end of the last one
+    streams_start = table_start + len(table) * TABLE_ROW.size
+    ends = streams_start + np.cumsum([0, *(packed_size for packed_size, _ in table)], dtype=object)
+    if ends[-1] > len(packed):
+        problem = f"truncated or damaged: expected {ends[-1]} bytes for {header.count} Gaussians, found {len(packed)}"
+        raise SceneError(path, problem, arrays.EXPORT_AGAIN)
     streams = [packed[start:end] for start, end in pairwise(ends)]
     try:  # streams must be whole, and fit their checksums if they have any; a stream may not state its size
         if any(
@@ -225,28 +241,6 @@ def _zstandard_parts(
     return header, parts, packed[HEADER.size + TABLE_START.size : table_start][:_MAX_EXTENSIONS], len(packed) - ends[-1]
 
 
-def _read_table(path: StrPath, packed: bytes, header: Header, sizes: list[int]) -> tuple[int, np.ndarray]:
-    """Return where the table of version 4 starts, and the start of each stream followed by the end of the last one.
-
-    Both results are positions in the file, in bytes. ``sizes``: bytes of each unpacked column. Raise SceneError if the
-    table contradicts ``sizes``, or if the file is too short for the table.
-    """
-    try:
-        (table_start,) = TABLE_START.unpack_from(packed, HEADER.size)
-        table = [TABLE_ROW.unpack_from(packed, table_start + i * TABLE_ROW.size) for i in range(header.num_streams)]
-    except struct.error as error:
-        raise SceneError(path, FOUND_EARLY_END, arrays.EXPORT_AGAIN) from error
-    if [unpacked_size for _, unpacked_size in table] != sizes:
-        problem = f"damaged: expected columns of {sizes} bytes for {header.count} Gaussians, found others"
-        raise SceneError(path, problem, arrays.EXPORT_AGAIN)
-    streams_start = table_start + len(table) * TABLE_ROW.size
-    ends = streams_start + np.cumsum([0, *(packed_size for packed_size, _ in table)], dtype=object)
-    if ends[-1] > len(packed):
-        problem = f"truncated or damaged: expected {ends[-1]} bytes for {header.count} Gaussians, found {len(packed)}"
-        raise SceneError(path, problem, arrays.EXPORT_AGAIN)
-    return table_start, ends
-
-
 def _unpack(parts: list[np.ndarray], header: Header) -> arrays.Columns:
     """Convert a block of rows, given as a part of each stored column, to Gaussians."""
     version, fraction = header.version, header.fraction
@@ -256,26 +250,24 @@ def _unpack(parts: list[np.ndarray], header: Header) -> arrays.Columns:
     words = np.zeros((len(means), 3, 4), np.uint8)
     if version > 1:
         words[..., 1:] = means.reshape(-1, 3, 3)
+    if version < 3:
+        xyz = rotations / 127.5 - 1
+        w = np.sqrt(np.clip(1 - (xyz**2).sum(1, keepdims=True), 0, None))
+        quats = np.concatenate([w, xyz], 1)
+    else:
+        rotation_words = rotations.view("<u4")[:, 0]  # the top two bits name the largest of xyzw
+        largest = (rotation_words >> np.uint32(30)).astype(int)
+        codes = np.stack([rotation_words >> np.uint32(shift) & np.uint32(1023) for shift in _SHIFTS], 1)
+        smallest = np.where(codes & 512, -1.0, 1.0) * (codes & 511) / (511 * np.sqrt(2.0))
+        quats = np.roll(arrays.from_smallest_three(largest, smallest), 1, axis=1)
     return arrays.Columns(
         means=means.view("<f2").astype(float) if version == 1 else (words.view("<i4")[..., 0] >> 8) / 2.0**fraction,
-        quats=_read_rotations(rotations, version),
+        quats=quats,
         log_scales=scales / 16 - 10,
         opacities=opacities[:, 0] / 255,
         sh0=rgb_to_sh0(0.5 + SH_C0 * (colors / 255 - 0.5) / COLOR_SCALE),
         harmonics=(harmonics.reshape(len(harmonics), -1, 3) - np.float32(128)) / np.float32(128),  # exact
     )
-
-
-def _read_rotations(stored: np.ndarray, version: int) -> np.ndarray:
-    """Restore quaternions ``[n,4]`` wxyz from their bytes, as :func:`_pack_rotations` packs them."""
-    if version < 3:
-        xyz = stored / 127.5 - 1
-        w = np.sqrt(np.clip(1 - (xyz**2).sum(1, keepdims=True), 0, None))
-        return np.concatenate([w, xyz], 1)
-    words = stored.view("<u4")[:, 0]  # the top two bits name the largest of xyzw
-    parts = np.stack([words >> np.uint32(shift) & np.uint32(1023) for shift in _SHIFTS], 1)
-    smallest = np.where(parts & 512, -1.0, 1.0) * (parts & 511) / (511 * np.sqrt(2.0))
-    return np.roll(arrays.from_smallest_three((words >> np.uint32(30)).astype(int), smallest), 1, axis=1)
 
 
 def _octave(size: float) -> int:
@@ -328,36 +320,34 @@ def spz_columns(
 
 
 def _quantise(columns: arrays.Columns, header: Header) -> tuple[np.ndarray, ...]:
-    """Quantise a block of Gaussians to columns of bytes; harmonics in steps of 8 (degree 1) or 16."""
+    """Quantise a block of Gaussians to columns of bytes; harmonics in steps of 8 (degree 1) or 16.
+
+    Version 2 stores the x, y and z of a rotation as bytes, with signs for which w is positive. Version 3 stores a word
+    whose two highest bits are the index of the largest of xyzw. The sign and magnitude of each of the three other
+    components follow.
+    """
     fixed = quantise_means(columns.means, header.fraction)
     count, num_higher = columns.harmonics.shape[:2]
     steps = np.where(np.arange(num_higher) < 3, 8, 16)[:, None]
+    if header.version < 3:
+        rotations = arrays.to_bytes(127.5 * (np.where(columns.quats[:, :1] < 0, -1, 1) * columns.quats[:, 1:] + 1))
+    else:
+        largest, smallest = arrays.smallest_three(np.roll(columns.quats, -1, axis=1))
+        codes = np.minimum(np.floor(511 * np.abs(smallest) * np.sqrt(2.0) + 0.5), 511).astype(np.uint32)
+        codes |= (smallest < 0).astype(np.uint32) << np.uint32(9)
+        words = largest.astype(np.uint32) << np.uint32(30)
+        for i, shift in enumerate(_SHIFTS):
+            words |= codes[:, i] << np.uint32(shift)
+        rotations = words.astype("<u4")[:, None].view(np.uint8)
     stepped = (np.round(np.clip(columns.harmonics, -2, 2) * 128) + 128 + steps // 2) // steps * steps
     return (
         fixed.view(np.uint8).reshape(-1, 3, 4)[..., :3].reshape(-1, 9),  # three little-endian bytes for each coordinate
         arrays.to_bytes(255 * columns.opacities)[:, None],
         arrays.to_bytes(255 * (COLOR_SCALE * (columns.colors - 0.5) / SH_C0 + 0.5)),
         arrays.to_bytes(16 * (columns.log_scales + 10)),
-        _pack_rotations(columns.quats, header.version),
+        rotations,
         np.clip(stepped, 0, 255).astype(np.uint8).reshape(count, 3 * num_higher),
     )
-
-
-def _pack_rotations(quats: np.ndarray, version: int) -> np.ndarray:
-    """Pack unit quaternions ``[n,4]`` wxyz to bytes, which :func:`_read_rotations` unpacks.
-
-    Version 2 stores x, y and z as bytes, with signs for which w is positive. Version 3 stores a word whose two highest
-    bits are the index of the largest of xyzw. The sign and magnitude of each of the three other components follow.
-    """
-    if version < 3:
-        return arrays.to_bytes(127.5 * (np.where(quats[:, :1] < 0, -1, 1) * quats[:, 1:] + 1))
-    largest, smallest = arrays.smallest_three(np.roll(quats, -1, axis=1))
-    codes = np.minimum(np.floor(511 * np.abs(smallest) * np.sqrt(2.0) + 0.5), 511).astype(np.uint32)
-    codes |= (smallest < 0).astype(np.uint32) << np.uint32(9)
-    words = largest.astype(np.uint32) << np.uint32(30)
-    for i, shift in enumerate(_SHIFTS):
-        words |= codes[:, i] << np.uint32(shift)
-    return words.astype("<u4")[:, None].view(np.uint8)
 
 
 def spz_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> bytes:

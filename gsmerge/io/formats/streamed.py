@@ -12,7 +12,7 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
@@ -89,7 +89,16 @@ def write_output(add: AddOutput, path: Path, index: Path, contents: Contents) ->
         iterations = 1  # of the program's fit of palettes; ten take four times as long, and renders are not better
         run_program(*arguments, "--lod-chunk-count", CHUNK_THOUSANDS, "-i", iterations, program_index)
         with blame_program(path):
-            _name_by_content(program_index)
+            # A hash of the content is appended to the name of each chunk's folder. With these hashes, caches never mix
+            # chunks of two results
+            document = read_json(program_index)
+            for number, name in enumerate(document["filenames"]):
+                chunk_folder, digest = (program_index.parent / name).parent, hashlib.sha256()
+                for file in sorted(chunk_folder.iterdir()):
+                    digest.update(file.read_bytes())
+                renamed = chunk_folder.rename(f"{chunk_folder}-{digest.hexdigest()[:8]}")
+                document["filenames"][number] = f"{renamed.name}/{sog.META}"
+            program_index.write_bytes(json.dumps(document).encode())
             levels = read_index(program_index).levels
         index.write_bytes(program_index.read_bytes())
         written = dict[Path, list[Path]]()
@@ -103,21 +112,6 @@ def write_output(add: AddOutput, path: Path, index: Path, contents: Contents) ->
             level_path = path if is_finest else next(target for target in targets if target.name == sog.META)
             written[level_path] = [index, *temporaries] if is_finest else temporaries
     return written
-
-
-def _name_by_content(path: Path) -> None:
-    """Append a hash of the content to the name of each chunk's folder, also in the index ``path``.
-
-    With these hashes, caches never mix chunks of two results.
-    """
-    document = read_json(path)
-    for number, name in enumerate(document["filenames"]):
-        folder, digest = (path.parent / name).parent, hashlib.sha256()
-        for file in sorted(folder.iterdir()):
-            digest.update(file.read_bytes())
-        renamed = folder.rename(f"{folder}-{digest.hexdigest()[:8]}")
-        document["filenames"][number] = f"{renamed.name}/{sog.META}"
-    path.write_bytes(json.dumps(document).encode())
 
 
 @dataclass(frozen=True)
@@ -137,47 +131,54 @@ def read_index(path: Path) -> StreamedIndex:
     """Read a ``lod-meta.json``; raise SceneError if it is damaged or contradicts itself."""
     document = read_json(path)
     try:
-        return _check_index(path, document)
+        version = document.get("version", VERSION)
+        if version != VERSION:
+            problem = f"expected Streamed SOG version {VERSION}, found {version}"
+            raise SceneError(path, problem, f"export it as version {VERSION}")
+        levels = _list_levels(path, document)
+        if len({chunk for level in levels for chunk in level}) != sum(map(len, levels)):
+            raise ValueError("a chunk belongs to two levels")
+        environment = None if document.get("environment") is None else _chunk_path(path, document["environment"])
+        if any(environment in level for level in levels):
+            raise ValueError("the environment is also a chunk of a level")
+        index = StreamedIndex(levels, environment)
+        for name, tree_count in {"counts": index.counts, "count": sum(index.counts)}.items():
+            if document.get(name, tree_count) != tree_count:  # older files have neither
+                raise ValueError(f"{name}: the tree has {tree_count}, and the document says {document[name]}")
     except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError) as error:
         problem = f"expected the index of a Streamed SOG, found another file ({error})"
         raise SceneError(path, problem, "export it again") from error
-
-
-def _check_index(path: Path, document: dict[str, Any]) -> StreamedIndex:
-    """Return the content of an index; raise ValueError, LookupError or TypeError if the index is damaged."""
-    version = document.get("version", VERSION)
-    if version != VERSION:
-        problem = f"expected Streamed SOG version {VERSION}, found {version}"
-        raise SceneError(path, problem, f"export it as version {VERSION}")
-    levels = _list_levels(path, document)
-    if len({chunk for level in levels for chunk in level}) != sum(map(len, levels)):
-        raise ValueError("a chunk belongs to two levels")
-    environment = None if document.get("environment") is None else _chunk_path(path, document["environment"])
-    if any(environment in level for level in levels):
-        raise ValueError("the environment is also a chunk of a level")
-    index = StreamedIndex(levels, environment)
-    counts = index.counts
-    for name, tree_count in {"counts": counts, "count": sum(counts)}.items():
-        if document.get(name, tree_count) != tree_count:  # older files have neither
-            raise ValueError(f"{name}: the tree has {tree_count}, and the document says {document[name]}")
     return index
 
 
 def _list_levels(path: Path, document: dict[str, Any]) -> tuple[dict[Path, int], ...]:
-    """Return the chunks of each level with their numbers of Gaussians; :func:`_check_index` names the errors."""
+    """Return the chunks of each level with their numbers of Gaussians.
+
+    Raise ValueError, LookupError or TypeError if the index is damaged, such as by runs that overlap or have gaps.
+    """
     names = document["filenames"]
     max_levels = 64  # no real file has more than a dozen
     num_levels = check_whole(document["lodLevels"], "lodLevels", 1, max_levels)
     if not isinstance(names, list) or not names:
         raise ValueError("filenames: expected a list of paths")
     chunks = [_chunk_path(path, name) for name in names]
+    # For each run of rows of a level: the index of its chunk, its first row and its number of rows
     runs: list[list[tuple[int, int, int]]] = [[] for _ in range(num_levels)]
     for level, run in _walk_runs(document["tree"]):
         file = check_whole(run["file"], "file", 0, len(chunks) - 1)
         offset, count = (check_whole(run[key], key, 0) for key in ("offset", "count"))
         if count:
             runs[check_whole(level, "level", 0, num_levels - 1)].append((file, offset, count))
-    return tuple(_count_by_chunk(chunks, level_runs) for level_runs in runs)
+    levels = list[dict[Path, int]]()
+    for level_runs in runs:
+        counts: dict[Path, int] = {}
+        for file, offset, count in sorted(level_runs):
+            end = counts.get(chunks[file], 0)
+            if offset != end:
+                raise ValueError(f"runs of file {file}: expected a run that starts at {end}, found one at {offset}")
+            counts[chunks[file]] = end + count
+        levels.append(counts)
+    return tuple(levels)
 
 
 def _chunk_path(index: Path, name: Any) -> Path:
@@ -205,20 +206,6 @@ def _walk_runs(tree: dict[str, Any]) -> Iterator[tuple[int, dict[str, Any]]]:
             yield from ((int(level), run) for level, run in node["lods"].items())
 
 
-def _count_by_chunk(chunks: Sequence[Path], runs: Sequence[tuple[int, int, int]]) -> dict[Path, int]:
-    """Return the number of Gaussians in each chunk of a level; raise ValueError if its runs overlap or have gaps.
-
-    ``runs``: for each run of rows, the index of its chunk, its first row and its number of rows.
-    """
-    counts: dict[Path, int] = {}
-    for file, offset, count in sorted(runs):
-        end = counts.get(chunks[file], 0)
-        if offset != end:
-            raise ValueError(f"runs of file {file}: expected a run that starts at {end}, found one at {offset}")
-        counts[chunks[file]] = end + count
-    return counts
-
-
 def read_rows(path: Path, level: int = 0, index: StreamedIndex | None = None) -> arrays.StoredRows:
     """Read the Gaussians of one level; level 0, the finest, includes the environment.
 
@@ -231,27 +218,7 @@ def read_rows(path: Path, level: int = 0, index: StreamedIndex | None = None) ->
         chunks[index.environment] = None
     if not chunks:
         raise SceneError(path, f"expected Gaussians at level {level}, found none", "export it again")
-    contents = _read_chunks(path, chunks)
-    sizes: dict[str, int] = {}
-    for content in contents:
-        for name, size in content.sizes.items():
-            sizes[name] = sizes.get(name, 0) + size
-    counts = " + ".join(f"{count:,}" for count in index.counts)
-    name = f"Streamed SOG version {VERSION}, {counts} Gaussians at {count_words(len(index.levels), 'level')}"
-    rows = arrays.to_stored([content.packed for content in contents], name, sizes, contents[0].mode)
-    return replace(rows, bytes_beside=sum(content.num_bytes for content in contents))
-
-
-def read_level(path: Path, level: int, index: StreamedIndex | None = None) -> GaussianFile:
-    """Read one level of detail of a ``lod-meta.json``; 0 is the finest. Raise errors as :func:`read_gaussians`."""
-    return convert_stored([path], [read_rows(path, level, index)], "auto")
-
-
-def _read_chunks(path: Path, chunks: Mapping[Path, int | None]) -> list[sog.SogContent]:
-    """Read chunks; raise SceneError if together they take more memory than is allowed for one file of as many bytes.
-
-    ``chunks``: path of each chunk -> the number of Gaussians that the index states for it, or None.
-    """
+    # Together, the chunks may take as much memory as is allowed for one file of as many bytes
     root, real_paths = os.path.realpath(path.parent), set[Path]()
     contents: list[sog.SogContent] = []
     num_bytes, total, num_higher = check_file(path), 0, 0
@@ -269,7 +236,19 @@ def _read_chunks(path: Path, chunks: Mapping[Path, int | None]) -> list[sog.SogC
         num_bytes, total = num_bytes + contents[-1].num_bytes, total + packed.count
         num_higher = max(num_higher, packed.num_higher)
         arrays.check_gaussian_count(ReadBudget(path, num_bytes), total, num_higher, sog.PACKED_BYTES)
-    return contents
+    sizes: dict[str, int] = {}
+    for content in contents:
+        for name, size in content.sizes.items():
+            sizes[name] = sizes.get(name, 0) + size
+    counts = " + ".join(f"{count:,}" for count in index.counts)
+    name = f"Streamed SOG version {VERSION}, {counts} Gaussians at {count_words(len(index.levels), 'level')}"
+    rows = arrays.to_stored([content.packed for content in contents], name, sizes, contents[0].mode)
+    return replace(rows, bytes_beside=sum(content.num_bytes for content in contents))
+
+
+def read_level(path: Path, level: int, index: StreamedIndex | None = None) -> GaussianFile:
+    """Read one level of detail of a ``lod-meta.json``; 0 is the finest. Raise errors as :func:`read_gaussians`."""
+    return convert_stored([path], [read_rows(path, level, index)], "auto")
 
 
 def remove_unused_chunks(path: Path) -> None:
