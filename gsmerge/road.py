@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, Any
 
 from gsmerge.errors import Doubt, DoubtWarning, SceneError, TargetError
 from gsmerge.io import atomic_outputs
-from gsmerge.io.formats.rounding import format_notes
 from gsmerge.io.formats.rows import result_comments
 from gsmerge.io.formats.table import Contents
+from gsmerge.io.formats.write import format_notes
 from gsmerge.pipeline import build
 from gsmerge.plan import Plan, choose_blocks, is_without_views, make_plan, note_ignored, run_parts
 from gsmerge.prepare.crop import crop_scene

@@ -1,4 +1,4 @@
-"""Read and write zip archives. No member unpacks to more bytes than the archive's directory states."""
+"""Read zip archives. No member unpacks to more bytes than the archive's directory states."""
 
 from __future__ import annotations
 
@@ -23,13 +23,6 @@ def open_archive(path: StrPath) -> Iterator[zipfile.ZipFile]:
                 problem = f"expected members that are stored or deflated, found {info.filename!r:.80} packed by method"
                 raise SceneError(path, f"{problem} {info.compress_type}", "pack the archive again with one of these")
         yield archive
-
-
-def new_member(name: str) -> zipfile.ZipInfo:
-    """Make a member to write, with the date 1980 and the system Unix, so that equal members give equal archives."""
-    member = zipfile.ZipInfo(name)
-    member.create_system = 3
-    return member
 
 
 def read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:

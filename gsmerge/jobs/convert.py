@@ -18,9 +18,9 @@ from gsmerge.io.cameras.camera_file import CameraFile, to_cameras
 from gsmerge.io.cameras.viewer_cameras import viewer_cameras_path
 from gsmerge.io.formats.extra_columns import describe_extra_columns, join_extra_columns, read_extra_columns
 from gsmerge.io.formats.read_gaussians import FileInfo, kept_comments
-from gsmerge.io.formats.rounding import format_notes
 from gsmerge.io.formats.rows import RESULT_COMMENT, result_comments, states_vertical_axis, upward_axis
 from gsmerge.io.formats.table import Contents, Format
+from gsmerge.io.formats.write import format_notes
 from gsmerge.io.photo_files import read_images
 from gsmerge.kernels.matrices import matmul
 from gsmerge.prepare.place_cameras import place_viewpoints

@@ -9,8 +9,8 @@ import numpy as np
 
 from gsmerge.errors import Note, split_notes
 from gsmerge.geometry.transforms import camera_depths, rgb_to_sh0, sh0_to_rgb
-from gsmerge.io.formats.color_units import RGB_NOTE
 from gsmerge.io.formats.read_gaussians import GaussianFile
+from gsmerge.io.formats.units import RGB_NOTE
 from gsmerge.raster.photos import LEAST_OPACITY, shrink_pictures
 from gsmerge.reading.alignment import AlignmentResult
 from gsmerge.reading.loaded import Loaded

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gsmerge.geometry.views import scored_views
-from gsmerge.io.formats.rounding import round_as_written
+from gsmerge.io.formats.write import round_as_written
 from gsmerge.plan import Plan
 from gsmerge.prepare.prepare_scene import Prepared
 from gsmerge.raster.photos import NEAR_PLANE, WHOLE_SHARE, PhotoScore, scene_photos, score_photos

@@ -26,12 +26,11 @@ def measure_bytes(gaussians: Gaussians, file: Format, cameras: Cameras, names: S
     comments = RESULT_COMMENT, MIP_COMMENT
     if file.measure is not None:
         return file.measure(gaussians, cameras, comments)
-    if file.encode_contents is not None:
-        contents = Contents([gaussians], comments, cameras if names else cameras[:0], names)
-        placed_bytes = 700  # most bytes of the camera that is written if the scene has none
-        return len(file.encode_contents(gaussians, contents)) + placed_bytes * (file.first_view and not names)
     assert file.encode is not None  # all other formats have a fixed number of bytes for each Gaussian
-    return len(file.encode(gaussians, comments))
+    contents = Contents([gaussians], comments, cameras if names else cameras[:0], names)
+    # Most bytes of the camera that is written if the scene has none, unless it is written to a file beside
+    placed_bytes = 700 * (file.first_view and not file.settings and not names)
+    return len(file.encode(gaussians, contents)) + placed_bytes
 
 
 def meet_bytes(candidate: Candidate, prepared: Prepared, plan: Plan) -> Candidate:

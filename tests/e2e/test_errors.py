@@ -123,7 +123,7 @@ def test_failures_while_writing_leave_nothing(
     }[kind]
     if kind == "compact a state":
         assert run("extend", state, smallest_copy, *quick).code == 0
-    monkeypatch.setattr("gsmerge.io.formats.write.write_gaussians", half)
+    monkeypatch.setattr("gsmerge.io.formats.write._write_ply", half)
     monkeypatch.setattr("gsmerge.io.formats.gsm.save", half)
     before = listing(smallest_copy)
     outcome = run(*words, "--quiet", code=3)
@@ -138,19 +138,19 @@ def test_several_outputs_are_all_there_or_none(
     more: tuple[object, ...], smallest_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A disk that is full at the second level, or at the end."""
-    from gsmerge.io import write_gaussians
+    from gsmerge.io.formats import write
 
-    calls = itertools.count()
+    calls, kept = itertools.count(), write._write_ply
 
-    def full(path: Path, *arguments: Any, **named: Any) -> None:
+    def full(path: Path, *arguments: Any) -> None:
         if next(calls) == 1:
             raise OSError(errno.ENOSPC, "No space left on device")
-        write_gaussians(path, *arguments, **named)
+        kept(path, *arguments)
 
     def no_room(*_: object) -> str:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("gsmerge.io.formats.write.write_gaussians", full)
+    monkeypatch.setattr("gsmerge.io.formats.write._write_ply", full)
     monkeypatch.setattr("gsmerge.results.outputs.viewer_cameras", no_room)
     before = listing(smallest_copy)
     quick = ("--set", "superpixels=40", "--fit", "none")

@@ -67,7 +67,7 @@ def make_page(gaussians: Gaussians, cameras: Cameras, title: str, comments: Sequ
     start = 0 if is_free else median_camera(viewpoints)  # the first of the placed viewpoints is outside the scene
     poster = encode_still(to_picture(render(gaussians.numpy(), viewpoints[[start]]).images[0]))
     views = sorted({*even_views(len(viewpoints), min(len(viewpoints), MAX_VIEWPOINTS)), start})
-    files = {"engine": VIEWER.read_bytes(), "scene": sog_bytes(gaussians, comments)}
+    files = {"engine": VIEWER.read_bytes(), "scene": sog_bytes(gaussians, Contents([gaussians], comments))}
     return render_template(
         "site.html", policy=SITE_POLICY, title=title, count=len(gaussians), names=NAMES,
         poster=data_uri(poster, "image/webp"), licences=data_uri(_read_licences(), "text/plain"),

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, Any
 
 import numpy as np
 
@@ -35,12 +35,10 @@ from gsmerge.io.formats.rows import (
     to_stored,
 )
 from gsmerge.io.formats.spz import read_packed
+from gsmerge.io.formats.table import PLAIN, Contents
 from gsmerge.kernels.elementary import exp, log, power
 from gsmerge.kernels.matrices import matmul
 from gsmerge.types import NO_CAMERAS, Gaussians, number_views
-
-if TYPE_CHECKING:
-    from gsmerge.io.formats.table import Contents
 
 MAX_DEGREE = 3  # of harmonics, the highest of the extension
 NAME = "KHR_gaussian_splatting"
@@ -63,35 +61,27 @@ _STEPS_PER_NODE, _STEPS_PER_PART = 4, 100  # steps of 20 microseconds in a ReadB
 _MOVING_KEYS = {"matrix", "rotation", "scale", "translation"}  # keys of a node that moves its mesh and its children
 
 
-def encode_contents(gaussians: Gaussians, contents: Contents) -> bytes:
-    """Encode a ``.glb`` file as :func:`glb_bytes` does, with a camera node for each view in ``contents``.
-
-    The view nearest to the middle of all views is the first camera, since viewers look from the first camera.
-    """
-    cameras = contents.cameras if contents.options.viewer_cameras else NO_CAMERAS
-    names = contents.names or number_views(len(cameras))
-    nodes, gltf_cameras, view_ids = list[dict[str, Any]](), list[dict[str, Any]](), order_views(cameras)
-    near = 0.01  # distance of the near plane in world units, which `gsmerge render` uses, too
-    for i, view_id in enumerate(view_ids):
-        pose = np.eye(4)  # of glTF's cameras, which look along -z with y up
-        pose[:3, :3], pose[:3, 3] = cameras.viewmats[view_id, :3, :3].T * (1, -1, -1), cameras.centres[view_id]
-        pose = matmul(HALF_TURN, pose)
-        nodes.append({"name": names[view_id], "camera": i, "matrix": pose.T.reshape(-1).tolist()})
-        ratio = float(cameras.width * cameras.Ks[view_id, 1, 1] / (cameras.height * cameras.Ks[view_id, 0, 0]))
-        perspective = {"yfov": vertical_field(cameras, view_id), "aspectRatio": ratio, "znear": near}
-        gltf_cameras.append({"name": names[view_id], "type": "perspective", "perspective": perspective})
-    return glb_bytes(gaussians, nodes=nodes, cameras=gltf_cameras)
-
-
-def glb_bytes(
-    gaussians: Gaussians, _: Sequence[str] = (), *, nodes: Sequence[Any] = (), cameras: Sequence[Any] = ()
-) -> bytes:
+def glb_bytes(gaussians: Gaussians, contents: Contents = PLAIN) -> bytes:
     """Encode a ``.glb`` file without comments; raise ValueError if there is NaN or inf.
 
-    ``nodes`` and ``cameras``: further entries of the lists with these names in the glTF document.
+    The file has a camera node for each view in ``contents``. The view nearest to the middle of all views is the first
+    camera, since viewers look from the first camera.
 
     Rotations and opacities are 16-bit numbers, which the extension allows. All other values are float32.
     """
+    cameras = contents.cameras if contents.options.viewer_cameras else NO_CAMERAS
+    view_names = contents.names or number_views(len(cameras))
+    nodes: list[dict[str, Any]] = [{"mesh": 0}]
+    gltf_cameras = list[dict[str, Any]]()
+    near = 0.01  # distance of the near plane in world units, which `gsmerge render` uses, too
+    for i, view_id in enumerate(order_views(cameras)):
+        pose = np.eye(4)  # of glTF's cameras, which look along -z with y up
+        pose[:3, :3], pose[:3, 3] = cameras.viewmats[view_id, :3, :3].T * (1, -1, -1), cameras.centres[view_id]
+        pose = matmul(HALF_TURN, pose)
+        nodes.append({"name": view_names[view_id], "camera": i, "matrix": pose.T.reshape(-1).tolist()})
+        ratio = float(cameras.width * cameras.Ks[view_id, 1, 1] / (cameras.height * cameras.Ks[view_id, 0, 0]))
+        perspective = {"yfov": vertical_field(cameras, view_id), "aspectRatio": ratio, "znear": near}
+        gltf_cameras.append({"name": view_names[view_id], "type": "perspective", "perspective": perspective})
     num_higher = (min(MAX_DEGREE, gaussians.sh_degree) + 1) ** 2 - 1
     half_turn = rotator(np.diag([-1.0, -1.0, 1.0]), num_higher)  # from y down to y up
     blocks = [_attributes(half_turn(columns)) for _, columns in column_blocks(gaussians, MAX_DEGREE)]
@@ -118,8 +108,8 @@ def glb_bytes(
     accessor_ids = {name: i for i, name in enumerate(names)}
     document = {
         "extensionsUsed": [NAME],
-        "nodes": [{"mesh": 0}, *nodes],
-        **({"cameras": cameras} if cameras else {}),
+        "nodes": nodes,
+        **({"cameras": gltf_cameras} if gltf_cameras else {}),
         "meshes": [{"primitives": [{"attributes": accessor_ids, "mode": _POINTS, "extensions": {NAME: splats}}]}],
         "accessors": accessors,
         "bufferViews": views,

@@ -13,10 +13,9 @@ from gsmerge.errors import Doubt, Note, SceneError, count_words
 from gsmerge.geometry.transforms import lower_median, rgb_to_sh0
 from gsmerge.io.formats import ply
 from gsmerge.io.formats import rows as arrays
-from gsmerge.io.formats.color_units import ColorUnits, choose_colors
 from gsmerge.io.formats.rows import StoredRows
-from gsmerge.io.formats.scale_units import LINEAR_NOTE, are_scales_linear, with_linear_scales
 from gsmerge.io.formats.table import META, PLY, READ_ENDINGS, find_format
+from gsmerge.io.formats.units import LINEAR_NOTE, ColorUnits, are_scales_linear, choose_colors, with_linear_scales
 from gsmerge.kernels.elementary import exp
 from gsmerge.kernels.stored_rows import convert_rows
 from gsmerge.runtime.arguments import check_arguments

@@ -15,7 +15,7 @@ import math
 import os
 import zipfile
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -26,7 +26,7 @@ import numpy as np
 
 from gsmerge.arrays import to_float32
 from gsmerge.errors import SceneError
-from gsmerge.io.archives import new_member, open_archive, read_member
+from gsmerge.io.archives import open_archive, read_member
 from gsmerge.io.bounds import (
     ReadBudget,
     check_file,
@@ -38,7 +38,7 @@ from gsmerge.io.bounds import (
     read_text,
 )
 from gsmerge.io.formats import rows as arrays
-from gsmerge.io.formats.table import META
+from gsmerge.io.formats.table import META, PLAIN, Contents
 from gsmerge.kernels.elementary import expm1, log1p
 from gsmerge.types import Gaussians
 
@@ -269,16 +269,18 @@ def _to_numbers(values: Any, length: int) -> np.ndarray:
     return numbers
 
 
-def sog_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> bytes:
+def sog_bytes(gaussians: Gaussians, contents: Contents = PLAIN) -> bytes:
     """Encode a ``.sog``, with rows in the order of a space-filling curve; raise ValueError if there is NaN or inf.
 
-    ``comments`` may state the mode of rendering, see :func:`gsmerge.io.formats.rows.render_mode`.
+    Comments may state the mode of rendering, see :func:`gsmerge.io.formats.rows.render_mode`.
     """
     columns = arrays.to_columns(gaussians, MAX_DEGREE).along_curve()
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w") as archive:
-        for name, data in sog_files(columns, arrays.render_mode(comments)).items():
-            archive.writestr(new_member(name), data)
+        for name, data in sog_files(columns, arrays.render_mode(contents.comments)).items():
+            member = zipfile.ZipInfo(name)  # with the date 1980
+            member.create_system = 3  # Unix on every system, so that equal files give equal archives
+            archive.writestr(member, data)
     return content.getvalue()
 
 

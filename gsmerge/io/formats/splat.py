@@ -6,7 +6,6 @@ Harmonics above degree 0 cannot be stored.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +14,7 @@ from gsmerge.errors import SceneError
 from gsmerge.geometry.transforms import rgb_to_sh0
 from gsmerge.io.bounds import check_file, read_errors
 from gsmerge.io.formats.rows import EXPORT_AGAIN, Columns, Packed, StoredRows, column_blocks, to_bytes, to_stored
+from gsmerge.io.formats.table import PLAIN, Contents
 from gsmerge.kernels.elementary import exp, log
 from gsmerge.types import Gaussians
 
@@ -22,8 +22,8 @@ MAX_DEGREE = 0  # of harmonics, since the format has only colours
 ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("colors", "u1", 4), ("quats", "u1", 4)])
 
 
-def splat_bytes(gaussians: Gaussians, _: Sequence[str] = ()) -> bytes:
-    """Encode a ``.splat`` file, which has no comments; raise ValueError if there is NaN or inf."""
+def splat_bytes(gaussians: Gaussians, _: Contents = PLAIN) -> bytes:
+    """Encode a ``.splat`` file, which has only Gaussians; raise ValueError if there is NaN or inf."""
     all_rows = np.empty(len(gaussians), ROW)
     for start, columns in column_blocks(gaussians, MAX_DEGREE):
         rows = all_rows[start : start + len(columns)]

@@ -30,7 +30,7 @@ from gsmerge.errors import SceneError
 from gsmerge.geometry.transforms import rgb_to_sh0
 from gsmerge.io.bounds import ReadBudget, check_file, read_errors
 from gsmerge.io.formats import rows as arrays
-from gsmerge.io.formats.table import Contents
+from gsmerge.io.formats.table import PLAIN, Contents
 from gsmerge.types import SH_C0, Gaussians, StrPath
 
 # Default version and largest degree of harmonics of written files. Spark 2.2 does not read version 4 of the format, and
@@ -350,16 +350,10 @@ def _quantise(columns: arrays.Columns, header: Header) -> tuple[np.ndarray, ...]
     )
 
 
-def spz_bytes(gaussians: Gaussians, comments: Sequence[str] = ()) -> bytes:
-    """Encode a ``.spz`` file of version 3; raise ValueError if there is NaN or inf.
-
-    ``comments`` may state the mode of rendering, see :func:`gsmerge.io.formats.rows.render_mode`.
-    """
-    return encode_contents(gaussians, Contents([gaussians], comments))
-
-
-def encode_contents(gaussians: Gaussians, contents: Contents) -> bytes:
+def spz_bytes(gaussians: Gaussians, contents: Contents = PLAIN) -> bytes:
     """Encode a ``.spz`` file in the version of ``contents.options``; raise ValueError if there is NaN or inf.
+
+    Comments may state the mode of rendering, see :func:`gsmerge.io.formats.rows.render_mode`.
 
     The file has no extensions, since three 0.187 and mkkellogg's viewer refuse bytes after the columns.
     """

@@ -43,6 +43,7 @@ class Contents:
     extra_columns: np.ndarray | None = None  # structured array ``[n]``: additional columns of a ``.ply`` with one level
 
 
+PLAIN = Contents(())  # beside Gaussians, a file gets no comments and no cameras, and options have their defaults
 # Type of functions that write all files of an output. The arguments are the function from
 # :func:`gsmerge.io.atomic_outputs` that adds a temporary file, the path of the output, the temporary file of this path,
 # and the content. The result is a dictionary: path of each level of detail, finest first -> temporary files of the
@@ -62,11 +63,10 @@ class Format:
     ending: str  # of names, in lower case; without a leading dot, it is the whole name of a folder's main file
     about: str  # description for people
     read: Callable[[Path], StoredRows] | None  # None: the format is only written
-    # Returns the content of one file with Gaussians and comments; None: ``write_ply`` or ``write`` writes the file
-    encode: Callable[[Gaussians, Sequence[str]], bytes] | None
+    # Returns a file with Gaussians, and with what the format stores of the rest of the content; None: ``write_ply`` or
+    # ``write`` writes the file
+    encode: Callable[[Gaussians, Contents], bytes] | None
     max_degree: int  # largest degree of harmonics that is written; -1: the format is only read
-    # Replaces ``encode`` in formats whose files also depend on cameras and options; None in other formats
-    encode_contents: Callable[[Gaussians, Contents], bytes] | None = None
     first_view: bool = False  # True: viewers start at the first camera of a file, which always gets one
     beside: str = ""  # name of a file that is written beside an output; "": none
     # Name of a file beside the output that gives viewers their first camera. {stem} is the output's name without its
@@ -147,7 +147,7 @@ FILES = (  # the first ending that matches counts, so .compressed.ply comes befo
     PLY,
     Format(
         ".spz", "Niantic's format; written as version 3 or 2", _lazy("spz.read_rows"), _lazy("spz.spz_bytes"), 3,
-        encode_contents=_lazy("spz.encode_contents"), max_gaussians=10_000_000, gaussian_bytes=_SPZ,
+        max_gaussians=10_000_000, gaussian_bytes=_SPZ,
         round_means=_lazy("spz.round_means"), marks=(MIP_COMMENT,),
     ),
     Format(
@@ -161,7 +161,7 @@ FILES = (  # the first ending that matches counts, so .compressed.ply comes befo
     ),
     Format(
         ".glb", "binary glTF with KHR_gaussian_splatting", _lazy("glb.read_rows"), _lazy("glb.glb_bytes"), 3,
-        encode_contents=_lazy("glb.encode_contents"), first_view=True, holds=_lazy("glb.holds_gaussians"),
+        first_view=True, holds=_lazy("glb.holds_gaussians"),
         gaussian_bytes=(52.1, 88.1, 148.1, 232.2),
     ),
 )  # fmt: skip

@@ -21,7 +21,7 @@ from gsmerge.io.bounds import read_json
 from gsmerge.io.formats import glb
 from gsmerge.io.formats.glb import COLOR_SPACE, COMPRESSED, HALF_TURN, HARMONICS, NAME, pack_glb
 from gsmerge.io.formats.rows import StoredRows
-from gsmerge.io.formats.spz import MAX_DEGREE, encode_contents
+from gsmerge.io.formats.spz import MAX_DEGREE, spz_bytes
 from gsmerge.io.formats.table import TILESET, Contents
 from gsmerge.kernels.elementary import cos, sin
 from gsmerge.kernels.matrices import matmul
@@ -96,7 +96,7 @@ def most_bytes(gaussians: Gaussians, cameras: Cameras, comments: Sequence[str]) 
 
 def _tile_bytes(contents: Contents, low: np.ndarray, high: np.ndarray) -> bytes:
     """Encode the ``.glb`` of a tile, whose Gaussians lie mostly between the corners ``low [3]`` and ``high [3]``."""
-    gaussians, packed = contents.levels[0], encode_contents(contents.levels[0], contents)
+    gaussians, packed = contents.levels[0], spz_bytes(contents.levels[0], contents)
     num_harmonics = (min(MAX_DEGREE, gaussians.sh_degree) + 1) ** 2
     names = ["POSITION", "COLOR_0", f"{NAME}:ROTATION", f"{NAME}:SCALE", *HARMONICS[1:num_harmonics]]
     accessors: list[dict[str, Any]] = [{"componentType": 5126, "type": "VEC3", "count": len(gaussians)} for _ in names]

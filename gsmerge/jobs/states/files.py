@@ -12,9 +12,9 @@ from typing import Any
 
 from gsmerge.errors import SceneError, UsageError, count_words
 from gsmerge.io.atomic import common_mode
-from gsmerge.io.formats.rounding import format_notes
 from gsmerge.io.formats.rows import result_comments
 from gsmerge.io.formats.table import Contents
+from gsmerge.io.formats.write import format_notes
 from gsmerge.io.locks import lock_file
 from gsmerge.jobs.states.compactor import extend_state
 from gsmerge.jobs.states.extend import BATCH

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from messages import noted
 
-from gsmerge.io.formats.rounding import rounding_notes
 from gsmerge.io.formats.splat_transform import VARIABLE
 from gsmerge.io.formats.table import INDEX, OUTPUT_FORMATS
+from gsmerge.io.formats.write import rounding_notes
 from gsmerge.types import Gaussians
 
 NAMES = ("lod-meta.json", "a.html", *(f"a{ending}" for ending in OUTPUT_FORMATS))

@@ -22,7 +22,7 @@ from gsmerge.io import kept_comments, read_gaussians, write_gaussians
 from gsmerge.io.formats.glb import glb_bytes
 from gsmerge.io.formats.read_gaussians import file_notes
 from gsmerge.io.formats.splat import splat_bytes
-from gsmerge.io.formats.spz import AXIS_SYSTEMS, encode_contents, gzip_bytes, spz_bytes
+from gsmerge.io.formats.spz import AXIS_SYSTEMS, gzip_bytes, spz_bytes
 from gsmerge.io.formats.table import Contents
 from gsmerge.settings.files import FileOptions
 
@@ -85,7 +85,7 @@ def test_version_2_has_rotations_of_a_byte_each(tmp_path: Path) -> None:
     """All else is as in version 3."""
     for version in (2, 3):
         contents = Contents([some_gaussians(3)], options=FileOptions(spz_version=version))
-        (tmp_path / f"{version}.spz").write_bytes(encode_contents(some_gaussians(3), contents))
+        (tmp_path / f"{version}.spz").write_bytes(spz_bytes(some_gaussians(3), contents))
     old, new = (read_gaussians(tmp_path / f"{version}.spz") for version in (2, 3))
     assert old.info.layout == ".spz version 2, SH degree 3"
     assert float(np.abs((old.gaussians.quats * some_gaussians(3).quats).sum(1)).min()) > 0.99

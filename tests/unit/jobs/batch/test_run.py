@@ -316,7 +316,7 @@ def test_a_scene_that_another_run_works_on_comes_last(scene: Path, out: Path, mo
 
 KILLS = {
     "while it reads": ("gsmerge.jobs.batch.jobs.content_hash", True),
-    "while it writes": ("gsmerge.io.formats.write.write_gaussians", False),
+    "while it writes": ("gsmerge.io.formats.write._write_ply", False),
     "before the result is renamed": ("gsmerge.io.atomic._flush", True),
     "before the record": ("gsmerge.jobs.batch.run.append_line", True),
     "before the mark is gone": ("gsmerge.jobs.batch.run.Path.unlink", True),
@@ -362,7 +362,7 @@ run_job(*one_job(Path({str(scene)!r}), Path({str(out)!r})), wait=False)
     [
         "gsmerge.jobs.batch.run.atomic_output",
         "gsmerge.jobs.batch.jobs.compact_files",
-        "gsmerge.io.formats.write.write_gaussians",
+        "gsmerge.io.formats.write._write_ply",
     ],
 )
 def test_a_full_disk_fails_the_scene_without_a_file_left(
