@@ -74,10 +74,16 @@ def atomic_outputs(*, overwrite: bool = False, mode: int = 0o666) -> Iterator[Ad
         yield outputs.add
         outputs.rename()
     except (SceneError, OSError) as error:
-        error_for_caller = outputs.name_error(error)
-        if error_for_caller is None:
+        # An error about a temporary file becomes an error about the caller's path
+        if isinstance(error, SceneError):
+            if error.path not in outputs.paths:
+                raise
+            raise SceneError(outputs.paths[error.path][0], error.problem, error.remedy) from error
+        if not outputs.paths or (error.errno not in _DISK_ERRORS and error.filename not in outputs.paths):
             raise
-        raise error_for_caller from error
+        path, _ = outputs.paths.get(str(error.filename), next(iter(outputs.paths.values())))
+        remedy = "close what has it open" if sys.platform == "win32" and isinstance(error, PermissionError) else ""
+        raise SceneError(path, f"could not be written ({error.strerror})", remedy) from error
     finally:
         for temporary in outputs.paths:  # temporary files that were not renamed
             with suppress(OSError):
@@ -170,18 +176,6 @@ class _Outputs:
             for path in renamed:
                 os.unlink(path)
             raise SceneError(error.filename, *_EXISTS) from error
-
-    def name_error(self, error: SceneError | OSError) -> SceneError | None:
-        """Convert an error about a temporary file to an error about the caller's path; None for any other error."""
-        if isinstance(error, SceneError):
-            if error.path not in self.paths:
-                return None
-            return SceneError(self.paths[error.path][0], error.problem, error.remedy)
-        if not self.paths or (error.errno not in _DISK_ERRORS and error.filename not in self.paths):
-            return None
-        path, _ = self.paths.get(str(error.filename), next(iter(self.paths.values())))
-        remedy = "close what has it open" if sys.platform == "win32" and isinstance(error, PermissionError) else ""
-        return SceneError(path, f"could not be written ({error.strerror})", remedy)
 
 
 def common_mode(paths: Iterable[Path]) -> int:

@@ -14,8 +14,7 @@ from gsmerge.drawing.preview import OUTSIDE_VIEW, BytePicture, to_picture
 from gsmerge.geometry.frame import Frame, scene_frame
 from gsmerge.geometry.transforms import middle_depth
 from gsmerge.geometry.views import even_views
-from gsmerge.io.encode_pictures import encode_picture
-from gsmerge.io.photo_files import photo_array
+from gsmerge.io.photo_files import encode_picture, photo_array
 from gsmerge.prepare.confirm_depths import Agreement, confirm_depths
 from gsmerge.raster import render
 from gsmerge.raster.metrics import is_worse

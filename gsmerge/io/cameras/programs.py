@@ -65,23 +65,21 @@ def join_matrices(source: CameraSource) -> list[Entry]:
     ``camera_id`` is a number, or the stem of the image's name. Views whose ``camera_id`` is a number are sorted by it.
     Other views keep the order of the file. Raise SceneError if one of the lists lacks a view.
     """
-    poses, Ks = (_matrices_by_id(source, key) for key in ("extrinsics", "intrinsics"))
+    matrices = list[dict[str, Any]]()  # by ``camera_id``; of matrices with equal ids, the last is taken
+    for key in ("extrinsics", "intrinsics"):
+        entries: Sequence[Mapping[str, Any]] = source.object[key]
+        if not isinstance(entries, list):
+            raise SceneError(source.path, f"expected {key!r} to be a list, found something else")
+        check_camera_count(source.path, len(entries))
+        with number_errors(source.path, f"{key}: expected entries of 'camera_id' and 'matrix'"):
+            matrices.append({str(entry["camera_id"]): entry["matrix"] for entry in entries})
+    poses, Ks = matrices
     if poses.keys() != Ks.keys():
         single = sorted(poses.keys() ^ Ks.keys())[0]
         problem = f"expected extrinsics and intrinsics of the same cameras, found only one for {single}"
         raise SceneError(source.path, problem)
     names = sorted(poses, key=natural_key) if all(name.isdecimal() for name in poses) else list(poses)
     return [Entry({"extrinsics": poses[name], "intrinsics": Ks[name]}, name=name) for name in names]
-
-
-def _matrices_by_id(source: CameraSource, key: str) -> dict[str, Any]:
-    """Return the matrices of the list ``key`` by their ``camera_id``. Of matrices with equal ids, the last is taken."""
-    entries: Sequence[Mapping[str, Any]] = source.object[key]
-    if not isinstance(entries, list):
-        raise SceneError(source.path, f"expected {key!r} to be a list, found something else")
-    check_camera_count(source.path, len(entries))
-    with number_errors(source.path, f"{key}: expected entries of 'camera_id' and 'matrix'"):
-        return {str(entry["camera_id"]): entry["matrix"] for entry in entries}
 
 
 def set_centred_size(source: CameraSource, views: list[StoredView]) -> list[StoredView]:

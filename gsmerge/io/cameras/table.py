@@ -22,8 +22,14 @@ from gsmerge.io.cameras.programs import (
     read_sharp,
     set_centred_size,
 )
-from gsmerge.io.cameras.read_views import read_views
-from gsmerge.io.cameras.view_layout import Matrix, PinholeKeys, RotationAndShift, ViewLayout, rotation_of_vector
+from gsmerge.io.cameras.view_layout import (
+    Matrix,
+    PinholeKeys,
+    RotationAndShift,
+    ViewLayout,
+    read_views,
+    rotation_of_vector,
+)
 from gsmerge.io.first_bytes import read_start
 from gsmerge.io.formats.table import STATE_ENDING
 from gsmerge.runtime.plugins import LazyFunction, lazy_functions

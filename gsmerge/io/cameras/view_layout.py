@@ -1,6 +1,6 @@
-"""Classes that declare how a file stores its views, by the keys of their poses, intrinsics, sizes and lenses.
+"""Declare how a file stores its views, by the keys of their poses, intrinsics, sizes and lenses, and read them.
 
-An entry in the table of camera formats may have a :class:`ViewLayout`, by which ``read_views.py`` reads files of the
+An entry in the table of camera formats may have a :class:`ViewLayout`, by which :func:`read_views` reads files of the
 format.
 """
 
@@ -8,14 +8,34 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from gsmerge.errors import SceneError
 from gsmerge.geometry.transforms import motion_matrices
-from gsmerge.io.cameras.camera_file import StoredView
-from gsmerge.io.cameras.camera_source import CameraSource, convert_value, to_array
+from gsmerge.io.cameras.camera_file import Lens, StoredView, check_camera_count, make_lens, make_pinhole
+from gsmerge.io.cameras.camera_source import (
+    CameraSource,
+    StoredCameras,
+    check_objects,
+    convert_value,
+    number_errors,
+    to_array,
+    to_number,
+)
+from gsmerge.io.image_names import find_image
+from gsmerge.io.photo_files import Size, image_size
+from gsmerge.kernels.elementary import cos, sin
+
+_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")  # the order of nerfstudio's "distortion_params"
+_COEFFICIENTS = (*_DISTORTION, "k5", "k6")
+# Camera models with distortion, and then all models that are read. Both sets lack OPENCV_FISHEYE
+_DISTORTED = {"OPENCV", "RADIAL", "SIMPLE_RADIAL"}
+_PINHOLE_OR_OPENCV = {"PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", *_DISTORTED}
+_FOCAL = ("fx", "fy", "angle_x", "angle_y")  # values from which a focal length follows
 
 Key = str | tuple[str, ...]  # a key, or several names of a key; the first name with a value is read
 
@@ -163,3 +183,179 @@ class ViewLayout:
         keys: dict[str, Key] = dict(vars(self.K)) if isinstance(self.K, PinholeKeys) else {}
         keys |= dict(zip(("w", "h"), self.size, strict=True)) if isinstance(self.size, tuple) else {}
         return {name: key for name, key in keys.items() if key}
+
+
+def read_views(source: CameraSource, layout: ViewLayout) -> StoredCameras:
+    """Read the cameras of a file by its layout. If a value is missing or wrong, SceneError names file, view and key."""
+    if callable(layout.views):
+        entries = layout.views(source)
+    else:  # the key of a list in a JSON object; with the key "", the whole file is the list
+        stored = source.object.get(layout.views) if layout.views else source.json
+        place = repr(layout.views) if layout.views else "the file"
+        if not isinstance(stored, list):
+            raise SceneError(source.path, f"expected {place} to be a list of objects, found something else")
+        check_objects(source.path, stored, place)
+        check_camera_count(source.path, len(stored))
+        entries = [Entry(view, source.object) for view in stored]
+    # Keys of intrinsics, size and lens that must have a value in each view, or in the object that views share
+    required_keys = [key for name, key in layout.number_keys.items() if not name.startswith("angle")]
+    required_keys += [layout.K.key] if isinstance(layout.K, Matrix) else []
+    required_keys += [key for key in (layout.size, layout.lens) if isinstance(key, str) and key]
+    required_keys = [key for key in required_keys if key not in layout.optional]
+    shared: dict[int, dict[str, Any]] = {}  # id of an object that views share -> its values, converted only once
+    cameras: list[tuple[Path, str, np.ndarray, dict[str, Any]]] = []
+    for i, entry in enumerate(entries):
+        names = (entry.values[key] for key in _alternatives(layout.name) if entry.values.get(key) not in (None, ""))
+        path, name = entry.path or source.path, entry.name or str(next(names, f"view {i}"))
+        missing: list[Key] = [key for key in layout.pose.keys if entry.values.get(key) is None]
+        for key in required_keys:
+            if _find_value(entry.values, key) is None and _find_value(entry.shared, key) is None:
+                missing.append(key)
+        if missing:
+            words = ", ".join(" or ".join(map(repr, _alternatives(key))) for key in missing)
+            raise SceneError(path, f"view {name}: expected {words}, found none")
+        if id(entry.shared) not in shared:
+            with number_errors(path, "expected numbers"):
+                shared[id(entry.shared)] = _camera_values(layout, entry.shared)
+        with number_errors(path, f"view {name}: expected numbers"):
+            values = shared[id(entry.shared)] | _camera_values(layout, entry.values)
+            cameras.append((path, name, layout.pose.read(entry.values), values))
+    has_intrinsics = any(key in values for *_, values in cameras for key in ("K", *_FOCAL))
+    size_of = cache(image_size)  # many views may name the same photo
+    views = []
+    for path, name, pose, values in cameras:
+        with number_errors(path, f"view {name}: expected numbers"):
+            lens = _lens(path, name, values) if layout.lens else None
+            K = None
+            if has_intrinsics:
+                K, values = _intrinsics(path, name, layout, values, size_of)
+            size = round(values.get("w", 0)), round(values.get("h", 0))
+            views.append(StoredView(name, pose, K, size, lens, values.get("mask", "")))
+    return StoredCameras(views if layout.finish is None else layout.finish(source, views))
+
+
+def _alternatives(key: Key) -> tuple[str, ...]:
+    """Return all names of a :data:`Key`, the most preferred first."""
+    return (key,) if isinstance(key, str) else key
+
+
+def _find_value(values: Mapping[str, Any], key: Key) -> Any:
+    """Return the value of a key under the first of the key's names that has a value; None if no name has a value."""
+    return next((values[name] for name in _alternatives(key) if values.get(name) is not None), None)
+
+
+def _camera_values(layout: ViewLayout, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Convert the intrinsics, size and lens in ``values``, which are those of one view, or are shared by all views.
+
+    The result has the names of ``number_keys``, "K" for a matrix, and "mask". For a lens it also has "model",
+    "is_fisheye", "distortion_params" and the coefficients. Names without a value in the file are left out. Errors are
+    those of :func:`convert_value`.
+    """
+    keys = layout.number_keys | ({name: name for name in _COEFFICIENTS} if layout.lens else {})
+    camera: dict[str, Any] = {}
+    for name, key in keys.items():
+        value = _find_value(values, key)
+        if value is not None:
+            camera[name] = convert_value(to_number, " or ".join(_alternatives(key)), value)
+    if isinstance(layout.size, str) and values.get(layout.size) is not None:
+        camera["h"], camera["w"] = convert_value(_two_numbers, layout.size, values[layout.size])
+    if isinstance(layout.K, Matrix) and values.get(layout.K.key) is not None:
+        camera["K"] = layout.K.read(values)
+    if values.get(layout.mask):
+        camera["mask"] = str(values[layout.mask])
+    if not layout.lens:
+        return camera
+    if values.get(layout.lens) is not None:
+        model = values[layout.lens]
+        max_model = 40  # most letters of a camera model's name
+        camera["model"] = str(layout.models.get(model, model)).upper()[:max_model]
+    if values.get("is_fisheye") is not None:
+        camera["is_fisheye"] = values["is_fisheye"]
+    if values.get("distortion_params") is not None:
+        numbers = values["distortion_params"][: len(_DISTORTION)]
+        camera["distortion_params"] = [convert_value(to_number, "distortion_params", number) for number in numbers]
+    return camera
+
+
+def _two_numbers(values: Any) -> tuple[float, float]:
+    """Convert a list of two JSON numbers; raise ValueError for another count."""
+    if len(values) != 2:
+        raise ValueError(f"expected two numbers, found {len(values)}")
+    return to_number(values[0]), to_number(values[1])
+
+
+def _intrinsics(
+    path: Path, name: str, layout: ViewLayout, values: dict[str, Any], size_of: Callable[[Path], Size]
+) -> tuple[np.ndarray, dict[str, Any]]:
+    """Return the intrinsics ``[3,3]`` of a view, converted to pixels from the unit and origin of the layout.
+
+    If the intrinsics need a size and the file has no size, the image's size is read by ``size_of``. Also return the
+    values of the view with this size. Raise SceneError if the intrinsics or the image are missing.
+    """
+    if isinstance(layout.K, Matrix):
+        K = values["K"]
+        if K.shape != (3, 3):
+            problem = f"expected 3x3 numbers in {layout.K.key!r}, found shape {K.shape}"
+            raise SceneError(path, f"view {name}: {problem}")
+        sides = [[round(values.get("w", 0.0))], [round(values.get("h", 0.0))], [1]]
+        return (K * np.array(sides) if layout.unit == "size" else K), values
+    keys = layout.number_keys
+    if not any(key in values for key in _FOCAL):
+        missing = ", ".join(str(keys[field]) for field in ("fx", "w", "h") if field not in values)
+        expected = ", ".join(str(keys[field]) for field in ("fx", "fy", "cx", "cy", "w", "h"))
+        problem = f"view {name}: expected intrinsics ({expected}), found none of {missing}"
+        raise SceneError(path, problem, "add them in pixels, for all views or for each")
+    has_size = values.get("w") and values.get("h")
+    if not has_size and not {"fx", "cx", "cy"} <= values.keys() and keys.get("w") in layout.optional:
+        w, h = repr(keys["w"]), repr(keys["h"])
+        image = find_image(path.parent, name, path, remedy=f"add {w} and {h} to the camera file")
+        if image is None:
+            raise SceneError(path, f"view {name}: expected {w} and {h}, found neither them nor the image itself")
+        values = values | dict(zip(("w", "h"), size_of(image), strict=True))
+    width, height = values.get("w", 0.0), values.get("h", 0.0)
+    unit = max(width, height) if layout.unit == "larger side" else 1.0  # pixels
+    fx, fy = _focal(values, "x", width), _focal(values, "y", height)
+    fx = fx or fy if layout.K.fx in layout.optional else fx
+    fy = fy or fx if layout.K.fy in layout.optional else fy
+    if layout.origin == "middle":
+        cx, cy = (side / 2 + unit * values.get(key, 0.0) for key, side in (("cx", width), ("cy", height)))
+    else:
+        cx, cy = values.get("cx", width / 2), values.get("cy", height / 2)
+    return make_pinhole(unit * fx, unit * fy, cx, cy), values
+
+
+def _focal(values: Mapping[str, float], axis: str, side: float) -> float:
+    """Return the focal length along an axis, or compute it from the angle of view; 0 if the file has no such values.
+
+    ``side``: pixels of the image along the axis.
+    """
+    if f"f{axis}" in values:
+        return values[f"f{axis}"]
+    if f"angle_{axis}" in values:
+        half = 0.5 * values[f"angle_{axis}"]
+        with np.errstate(all="ignore"):  # an angle of 0 gives an infinite focal length, which is refused later
+            return float(0.5 * side * cos(half) / sin(half))
+    return 0.0
+
+
+_PANORAMAS = ("equirect", "spher", "panoram")  # parts of the names of 360-degree models
+_CUT_PANORAMAS = "cut pinhole pictures out of the 360-degree panoramas first, as nerfstudio's ns-process-data does"
+
+
+def _lens(path: Path, name: str, values: Mapping[str, Any]) -> Lens | None:
+    """Return the lens of a view; None for a pinhole, and SceneError for a camera model that is not supported."""
+    model = values.get("model", "PINHOLE")
+    params = {key: values.get(key, 0.0) for key in _COEFFICIENTS}
+    if not any(params.values()):
+        params |= dict(zip(_DISTORTION, values.get("distortion_params", ()), strict=False))
+    if model == "OPENCV_FISHEYE" or values.get("is_fisheye"):
+        return make_lens("OPENCV_FISHEYE", "fisheye", [params[key] for key in ("k1", "k2", "k3", "k4")])
+    ambiguous = next((key for key in ("k4", "k5", "k6") if params[key]), None)
+    if model not in _PINHOLE_OR_OPENCV or ambiguous is not None:
+        distortion = f"lens distortion {ambiguous}, which formats understand differently"
+        found = f"camera model {model}" if ambiguous is None else distortion
+        problem = f"view {name}: expected a pinhole, OPENCV or OPENCV_FISHEYE camera, found {found}"
+        is_panorama = any(part in model.lower() for part in _PANORAMAS)
+        raise SceneError(path, problem, _CUT_PANORAMAS if is_panorama else "undistort the images first")
+    coefficients = [params[key] for key in ("k1", "k2", "p1", "p2", "k3")]
+    return make_lens(model if model in _DISTORTED else "OPENCV", "perspective", coefficients)

@@ -59,12 +59,26 @@ def packed_rows(path: Path, elements: Mapping[str, Element]) -> arrays.PackedRow
     ranges = chunk.rows[:]
 
     def unpack(block: slice) -> arrays.Columns:
-        """Unpack a block of Gaussians."""
+        """Unpack the Gaussians of a block of rows, with opacities as logits."""
         codes = np.empty((block.stop - block.start, num_rest), np.uint8)
         harmonics = elements["sh"].rows[block] if num_rest else codes
         for i in range(num_rest):
             codes[:, i] = harmonics[f"f_rest_{i}"]
-        return _unpack(vertex.rows[block], ranges, codes, block)
+        rows = vertex.rows[block]
+        words = {name: rows[name].astype(np.uint32) for name in PACKED}
+        chunk_ids = np.arange(block.start, block.stop) // CHUNK
+        *colors, alpha = _unpack_words(words["packed_color"], (8, 8, 8, 8))
+        largest = (words["packed_rotation"] >> np.uint32(30)).astype(np.int64)  # index of a component of wxyz
+        smallest = np.stack(_unpack_words(words["packed_rotation"], (10, 10, 10)), 1) - 0.5  # within +-sqrt(1/2)
+        positions, scales = (_unpack_words(words[name], (11, 10, 11)) for name in ("packed_position", "packed_scale"))
+        return arrays.Columns(
+            means=_interpolate(positions, ranges, _POSITION_RANGES, chunk_ids),
+            quats=arrays.from_smallest_three(largest, smallest * np.sqrt(2.0)),
+            log_scales=_interpolate(scales, ranges, _SCALE_RANGES, chunk_ids),
+            opacities=log(alpha) - log1p(-alpha),  # infinite for 0 and 1, which the reader accepts
+            sh0=rgb_to_sh0(_interpolate(colors, ranges, COLOR_RANGES, chunk_ids)),
+            harmonics=_HARMONICS[codes.reshape(len(rows), 3, -1).transpose(0, 2, 1)],
+        )
 
     return arrays.pack_rows([arrays.Packed(count, num_rest // 3, unpack)])
 
@@ -77,26 +91,6 @@ def _check_types(path: Path, element: Element, columns: tuple[str, ...], types: 
     if wrong is not None:
         place, found = f"in element '{element.name}' of a compressed file", stored.get(wrong, "none")
         raise SceneError(path, f"expected {wrong} {place} as {types[0]}, found {found}", "export it again")
-
-
-def _unpack(vertex: np.ndarray, chunk: np.ndarray, codes: np.ndarray, block: slice) -> arrays.Columns:
-    """Unpack the Gaussians of a ``block`` of rows, with opacities as logits.
-
-    ``vertex``: the rows. ``chunk``: the bounds of all chunks. ``codes``: bytes of harmonics, ``[n,3k]``.
-    """
-    words = {name: vertex[name].astype(np.uint32) for name in PACKED}
-    chunk_ids = np.arange(block.start, block.stop) // CHUNK
-    *colors, alpha = _unpack_words(words["packed_color"], (8, 8, 8, 8))
-    largest = (words["packed_rotation"] >> np.uint32(30)).astype(np.int64)  # index of a component of wxyz
-    smallest = np.stack(_unpack_words(words["packed_rotation"], (10, 10, 10)), 1) - 0.5  # within +-sqrt(1/2)
-    return arrays.Columns(
-        means=_interpolate(_unpack_words(words["packed_position"], (11, 10, 11)), chunk, _POSITION_RANGES, chunk_ids),
-        quats=arrays.from_smallest_three(largest, smallest * np.sqrt(2.0)),
-        log_scales=_interpolate(_unpack_words(words["packed_scale"], (11, 10, 11)), chunk, _SCALE_RANGES, chunk_ids),
-        opacities=log(alpha) - log1p(-alpha),  # infinite for 0 and 1, which the reader accepts
-        sh0=rgb_to_sh0(_interpolate(colors, chunk, COLOR_RANGES, chunk_ids)),
-        harmonics=_HARMONICS[codes.reshape(len(vertex), 3, -1).transpose(0, 2, 1)],
-    )
 
 
 def _interpolate(

@@ -385,24 +385,8 @@ def fit_codebook(values: np.ndarray) -> np.ndarray:
     equal_width = np.searchsorted(ordered, np.linspace(ordered[0], ordered[-1], _CELLS))
     equal_count = np.linspace(0, len(ordered), _CELLS).astype(int)
     ends = np.unique([*equal_width, *equal_count])
-    codes = _merge_cells(np.diff(ends).astype(float), np.diff(sums[ends]) / np.diff(ends))
-    max_steps = 200  # steps of Lloyd's algorithm
-    for _ in range(max_steps):
-        ends = np.concatenate([[0], np.searchsorted(ordered, (codes[1:] + codes[:-1]) / 2), [len(ordered)]])
-        numbers, totals = np.diff(ends), np.diff(sums[ends])
-        cell_means = np.where(numbers > 0, totals / np.maximum(numbers, 1), codes)
-        if np.array_equal(cell_means, codes):
-            break
-        codes = np.sort(cell_means)
-    return codes
-
-
-def _merge_cells(numbers: np.ndarray, means: np.ndarray) -> np.ndarray:
-    """Merge neighbouring cells until 256 cells are left, and return the means of their values.
-
-    ``numbers [n]``: how many values each cell has. ``means [n]``: the mean of the values in each cell.
-    """
-    count, mean = numbers.tolist(), means.tolist()
+    # How many values each cell has, and their mean. Neighbouring cells are merged until 256 cells are left
+    count, mean = np.diff(ends).astype(float).tolist(), (np.diff(sums[ends]) / np.diff(ends)).tolist()
     previous, following = list(range(-1, len(count) - 1)), list(range(1, len(count) + 1))
 
     def merge_entry(i: int) -> tuple[float, int, int, float, float]:
@@ -425,7 +409,16 @@ def _merge_cells(numbers: np.ndarray, means: np.ndarray) -> np.ndarray:
             heapq.heappush(heap, merge_entry(i))
         if previous[i] >= 0:
             heapq.heappush(heap, merge_entry(previous[i]))
-    return np.array([m for m, n in zip(mean, count, strict=True) if n > 0])
+    codes = np.array([m for m, n in zip(mean, count, strict=True) if n > 0])
+    max_steps = 200  # steps of Lloyd's algorithm
+    for _ in range(max_steps):
+        ends = np.concatenate([[0], np.searchsorted(ordered, (codes[1:] + codes[:-1]) / 2), [len(ordered)]])
+        numbers, totals = np.diff(ends), np.diff(sums[ends])
+        cell_means = np.where(numbers > 0, totals / np.maximum(numbers, 1), codes)
+        if np.array_equal(cell_means, codes):
+            break
+        codes = np.sort(cell_means)
+    return codes
 
 
 def nearest_codes(codebook: np.ndarray, values: np.ndarray) -> np.ndarray:

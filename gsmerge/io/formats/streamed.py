@@ -12,7 +12,7 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
@@ -164,11 +164,21 @@ def _list_levels(path: Path, document: dict[str, Any]) -> tuple[dict[Path, int],
     chunks = [_chunk_path(path, name) for name in names]
     # For each run of rows of a level: the index of its chunk, its first row and its number of rows
     runs: list[list[tuple[int, int, int]]] = [[] for _ in range(num_levels)]
-    for level, run in _walk_runs(document["tree"]):
-        file = check_whole(run["file"], "file", 0, len(chunks) - 1)
-        offset, count = (check_whole(run[key], key, 0) for key in ("offset", "count"))
-        if count:
-            runs[check_whole(level, "level", 0, num_levels - 1)].append((file, offset, count))
+    nodes = [document["tree"]]
+    while nodes:
+        node = nodes.pop()
+        low, high = (np.array(node["bound"][key], np.float64) for key in ("min", "max"))
+        if low.shape != (3,) or high.shape != (3,) or not (low <= high).all():
+            raise ValueError("bound: expected three numbers of min and three of max, none of them below min")
+        if ("lods" in node) == ("children" in node):
+            raise ValueError("a node must have either children or lods")
+        nodes += reversed(node.get("children", []))
+        for level, run in node.get("lods", {}).items():
+            number = int(level)
+            file = check_whole(run["file"], "file", 0, len(chunks) - 1)
+            offset, count = (check_whole(run[key], key, 0) for key in ("offset", "count"))
+            if count:
+                runs[check_whole(number, "level", 0, num_levels - 1)].append((file, offset, count))
     levels = list[dict[Path, int]]()
     for level_runs in runs:
         counts: dict[Path, int] = {}
@@ -188,22 +198,6 @@ def _chunk_path(index: Path, name: Any) -> Path:
     if is_outside or chunk.name != sog.META:
         raise ValueError(f"{name!r:.80}: expected the path of a {sog.META} inside the folder")
     return index.parent / chunk
-
-
-def _walk_runs(tree: dict[str, Any]) -> Iterator[tuple[int, dict[str, Any]]]:
-    """Yield the level and the content of each run of the tree, leaf by leaf; raise ValueError for an invalid node."""
-    nodes = [tree]
-    while nodes:
-        node = nodes.pop()
-        low, high = (np.array(node["bound"][key], np.float64) for key in ("min", "max"))
-        if low.shape != (3,) or high.shape != (3,) or not (low <= high).all():
-            raise ValueError("bound: expected three numbers of min and three of max, none of them below min")
-        if ("lods" in node) == ("children" in node):
-            raise ValueError("a node must have either children or lods")
-        if "children" in node:
-            nodes += reversed(node["children"])
-        else:
-            yield from ((int(level), run) for level, run in node["lods"].items())
 
 
 def read_rows(path: Path, level: int = 0, index: StreamedIndex | None = None) -> arrays.StoredRows:

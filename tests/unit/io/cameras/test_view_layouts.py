@@ -18,9 +18,8 @@ from gsmerge.geometry.transforms import mean_pose_frame, quat_to_rotmat, rotmat_
 from gsmerge.io import read_cameras, to_cameras
 from gsmerge.io.cameras.camera_source import CameraSource
 from gsmerge.io.cameras.read_cameras import find_cameras, find_other_cameras
-from gsmerge.io.cameras.read_views import read_views
 from gsmerge.io.cameras.table import CAMERA_FORMATS
-from gsmerge.io.cameras.view_layout import PinholeKeys, RotationAndShift, ViewLayout
+from gsmerge.io.cameras.view_layout import PinholeKeys, RotationAndShift, ViewLayout, read_views
 from gsmerge.kernels.elementary import arctan2
 
 Change = Callable[[Any], object]
