@@ -158,7 +158,15 @@ class _Outputs:
         for temporary, (_, target) in self.paths.items():
             _flush(temporary)
             if sys.platform != "win32" and os.path.exists(target):
-                _copy_rights(target, temporary)
+                # The file gets the mode of the file that it replaces, and its group and owner if the system allows that
+                status = os.stat(target)
+                with suppress(OSError):
+                    os.chown(temporary, -1, status.st_gid)
+                    os.chown(temporary, status.st_uid, -1)
+                # Without this group, the file's own group gets only the rights that the replaced file gives to everyone
+                mode, has_group = status.st_mode & 0o777, os.stat(temporary).st_gid == status.st_gid
+                with suppress(OSError):  # a file system without modes
+                    os.chmod(temporary, mode if has_group else mode & (0o707 | (mode & 0o007) << 3))
         for folder in {folder.parent for folder in self.new_folders}:
             _flush_names(folder)
         files = [
@@ -185,21 +193,6 @@ def common_mode(paths: Iterable[Path]) -> int:
     """
     files = (file for path in paths for file in (walk_files(path) if path.is_dir() else [path]))
     return reduce(and_, (os.stat(file).st_mode | _PRIVATE for file in files if os.path.exists(file)), 0o666)
-
-
-def _copy_rights(source: Path, path: str) -> None:
-    """Give a file the mode of ``source``, and the group and owner of ``source`` if the system allows that.
-
-    If the file cannot get the group of ``source``, its own group gets only the rights that ``source`` gives to
-    everyone.
-    """
-    status = os.stat(source)
-    with suppress(OSError):
-        os.chown(path, -1, status.st_gid)
-        os.chown(path, status.st_uid, -1)
-    mode, has_group = status.st_mode & 0o777, os.stat(path).st_gid == status.st_gid
-    with suppress(OSError):  # a file system without modes
-        os.chmod(path, mode if has_group else mode & (0o707 | (mode & 0o007) << 3))
 
 
 def _rename_to_new(temporary: str, target: Path) -> None:

@@ -51,15 +51,11 @@ class ReadBudget:
     memory_per_byte: int = _MEMORY_PER_BYTE
     remedy: str = ""
 
-    @property
-    def memory(self) -> int:
-        """Most bytes of memory for reading the file."""
-        return _FREE_MEMORY + self.memory_per_byte * self.file_bytes
-
     def check_memory(self, num_bytes: float, what: str) -> None:
         """Raise SceneError if ``num_bytes`` of memory, which ``what`` needs, are more than the file allows."""
-        if not num_bytes <= self.memory:
-            problem = f"expected at most {self.memory / 1e6:,.0f} MB of memory for a file of {self.file_bytes:,} bytes"
+        most = _FREE_MEMORY + self.memory_per_byte * self.file_bytes
+        if not num_bytes <= most:
+            problem = f"expected at most {most / 1e6:,.0f} MB of memory for a file of {self.file_bytes:,} bytes"
             raise SceneError(self.path, f"{problem}, found {what} of {num_bytes / 1e6:,.0f} MB", self.remedy)
 
     def check_steps(self, count: int, what: str) -> None:

@@ -194,8 +194,8 @@ def array_names(path: Path) -> frozenset[str]:
 def read_arrays(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
     """Read arrays from an ``.npz`` by name. Names that the file lacks are left out.
 
-    Raise SceneError if the file cannot be read, if an array holds anything but numbers and text, or if the arrays take
-    more memory than the file allows.
+    Raise SceneError if the file cannot be read, if an array holds anything but numbers and text or has too few bytes
+    for its shape, or if the arrays take more memory than the file allows.
     """
     budget = read_budget(path)
     if not zipfile.is_zipfile(path):
@@ -204,7 +204,19 @@ def read_arrays(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
         with open_archive(path) as archive, quiet_warnings():  # the library warns of headers in old styles
             members = {name: info for name, info in _members(archive).items() if name in names}
             budget.check_memory(sum(info.file_size for info in members.values()), "arrays")
-            return {name: _read_array(path, archive, info) for name, info in members.items()}
+            arrays: dict[str, np.ndarray] = {}
+            for name, info in members.items():
+                shape, dtype = _read_header(archive.open(info))
+                if dtype.kind not in _KINDS:
+                    kind = "objects, which are not read because they could run code"
+                    found = kind if dtype.hasobject else str(dtype)[:40]
+                    raise SceneError(path, f"{info.filename}: expected numbers, found {found}")
+                if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize > info.file_size:
+                    problem = f"expected as many bytes as shape {list(shape)} needs, found fewer"
+                    raise SceneError(path, f"{info.filename}: {problem}")
+                with archive.open(info) as file:
+                    arrays[name] = np.asarray(np.lib.format.read_array(file, allow_pickle=False))
+            return arrays
     except (SceneError, MemoryError):
         raise
     except Exception as error:  # a damaged archive may make the libraries raise any error
@@ -215,18 +227,6 @@ def read_arrays(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
 def _members(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
     """Return the members of an ``.npz`` that are arrays, by the names of the arrays."""
     return {info.filename[:-4]: info for info in archive.infolist() if info.filename.endswith(".npy")}
-
-
-def _read_array(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
-    """Read an array of an ``.npz``; raise SceneError if it has no numbers or text, or too few bytes for its shape."""
-    name, (shape, dtype) = info.filename, _read_header(archive.open(info))
-    if dtype.kind not in _KINDS:
-        kind = "objects, which are not read because they could run code" if dtype.hasobject else str(dtype)[:40]
-        raise SceneError(path, f"{name}: expected numbers, found {kind}")
-    if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize > info.file_size:
-        raise SceneError(path, f"{name}: expected as many bytes as shape {list(shape)} needs, found fewer")
-    with archive.open(info) as file:
-        return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
 
 
 def _read_header(stream: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:

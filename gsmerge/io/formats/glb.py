@@ -173,9 +173,31 @@ def read_rows(path: Path) -> StoredRows:
     with _damage_errors(path), path.open("rb") as file, np.errstate(all="ignore"):  # NaN and inf are set aside later
         document, total = _read_document(file, budget)
         content = _Content(budget, file, document, file.tell(), total)
-        for primitive, transform in _walk_splats(document, budget):
-            budget.check_steps(_STEPS_PER_PART * len(parts), "steps for meshes")
-            parts.append(_read_splats(content, primitive, transform, sizes, parts))
+        scenes, nodes, visited = document.get("scenes") or [{}], document.get("nodes", []), set[int]()
+        budget.check_steps(_STEPS_PER_NODE * len(nodes), "steps for nodes")
+        # Each node with the matrix ``[4,4]`` from the frame of its parent to the frame of a ``.ply``
+        stack = [(node_id, HALF_TURN) for node_id in scenes[document.get("scene", 0)].get("nodes", [])]
+        while stack:
+            node_id, transform = stack.pop()
+            if node_id in visited:
+                raise _ForeignError(f"one with two parents of node {node_id}")
+            visited.add(node_id)
+            node = nodes[node_id]
+            if not _MOVING_KEYS.isdisjoint(node):
+                matrix = np.eye(4)
+                if "matrix" in node:
+                    matrix = np.ascontiguousarray(np.array(node["matrix"], np.float64).reshape(4, 4).T)
+                else:
+                    x, y, z, w = node.get("rotation", (0, 0, 0, 1))
+                    rotation = quat_to_rotmat(np.array([[w, x, y, z]], np.float64))[0]
+                    matrix[:3, :3] = rotation * np.array(node.get("scale", (1, 1, 1)))
+                    matrix[:3, 3] = node.get("translation", (0, 0, 0))
+                transform = matmul(transform, matrix)
+            for primitive in document["meshes"][node["mesh"]]["primitives"] if "mesh" in node else []:
+                if NAME in primitive.get("extensions", {}):
+                    budget.check_steps(_STEPS_PER_PART * len(parts), "steps for meshes")
+                    parts.append(_read_splats(content, primitive, transform, sizes, parts))
+            stack += [(child, transform) for child in reversed(node.get("children", []))]
     if not parts:
         problem = f"expected Gaussians ({NAME}), found a .glb of points or a mesh"
         raise SceneError(path, problem, "name the .ply that the model wrote beside it")
@@ -283,33 +305,6 @@ def _read_document(file: IO[bytes], budget: ReadBudget) -> tuple[dict[str, Any],
         raise _ForeignError(f"one that requires {', '.join(sorted(map(str, missing)))}, which is not supported")
     file.read(_CHUNK_HEAD.size)  # of the binary chunk
     return document, total
-
-
-def _walk_splats(document: dict[str, Any], budget: ReadBudget) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
-    """Yield each primitive of Gaussians with the matrix ``[4,4]`` from its frame to the frame of a ``.ply``."""
-    scenes, nodes, visited = document.get("scenes") or [{}], document.get("nodes", []), set[int]()
-    budget.check_steps(_STEPS_PER_NODE * len(nodes), "steps for nodes")
-    stack = [(node_id, HALF_TURN) for node_id in scenes[document.get("scene", 0)].get("nodes", [])]
-    while stack:
-        node_id, parent_transform = stack.pop()
-        if node_id in visited:
-            raise _ForeignError(f"one with two parents of node {node_id}")
-        visited.add(node_id)
-        node = nodes[node_id]
-        transform = parent_transform
-        if not _MOVING_KEYS.isdisjoint(node):
-            matrix = np.eye(4)
-            if "matrix" in node:
-                matrix = np.ascontiguousarray(np.array(node["matrix"], np.float64).reshape(4, 4).T)
-            else:
-                x, y, z, w = node.get("rotation", (0, 0, 0, 1))
-                rotation = quat_to_rotmat(np.array([[w, x, y, z]], np.float64))[0]
-                matrix[:3, :3] = rotation * np.array(node.get("scale", (1, 1, 1)))
-                matrix[:3, 3] = node.get("translation", (0, 0, 0))
-            transform = matmul(parent_transform, matrix)
-        primitives = document["meshes"][node["mesh"]]["primitives"] if "mesh" in node else []
-        yield from ((primitive, transform) for primitive in primitives if NAME in primitive.get("extensions", {}))
-        stack += [(child, transform) for child in reversed(node.get("children", []))]
 
 
 def _read_splats(
