@@ -25,7 +25,7 @@ from gsmerge.io.photo_files import read_images
 from gsmerge.kernels.matrices import matmul
 from gsmerge.prepare.place_cameras import place_viewpoints
 from gsmerge.reading.scene_files import find_scene_files, named_path, result_cameras, scene_title
-from gsmerge.results.outputs import NUM_FULL, Outputs, frame_notes, pad_harmonics, write_outputs
+from gsmerge.results.outputs import NUM_FULL, Outputs, frame_notes, join_gaussians, pad_harmonics, write_outputs
 from gsmerge.runtime.documents import document_head, note_entries
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.record import report_progress
@@ -158,12 +158,6 @@ def _unseen_notes(options: ConvertOptions, unseen: int, count: int, cameras: Str
         share = f"{100 * unseen / count:.0f} % of the Gaussians"
         return [f"drop unseen: the cameras in {cameras} do not show {share}; are they those of this scene?"]
     return []
-
-
-def join_gaussians(parts: Sequence[Gaussians]) -> Gaussians:
-    """Join Gaussians of one world frame. Harmonics are padded with zeros to the highest degree of all parts."""
-    num_higher = max(gaussians.shN.shape[1] for gaussians in parts)
-    return parts[0] if len(parts) == 1 else Gaussians.concat([pad_harmonics(part, num_higher) for part in parts])
 
 
 def _find_cameras(options: ConvertOptions) -> tuple[CameraFile | None, list[str]]:

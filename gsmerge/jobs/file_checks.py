@@ -60,7 +60,16 @@ def check_content(path: Path, *, opacity: OpacityChoice = "auto", hints: ReadHin
     file that cannot be read is returned with its problem. UsageError if a package is missing.
     """
     try:
-        file_check = _read_scene(path, opacity, hints) if holds_scene(path) else _read_other(path)
+        if not holds_scene(path):
+            file_check = _read_other(path)
+        else:
+            load = load_files(find_scene_files(path), opacity=opacity, hints=hints)
+            info, images = load.info, load.scene.images
+            notes, num_photos = (*load.notes, *degree_notes(info)), 0 if images is None else len(images)
+            file_check = FileCheck(
+                str(path), "Gaussians", info.count, info.layout, info.file_bytes, notes=notes,
+                num_views=len(load.scene), num_photos=num_photos,
+            )  # fmt: skip
     except SceneError as error:
         return FileCheck(str(path), "", problems=(str(error).removeprefix(f"{path}: "),))
     size = 0 if path.is_dir() else path.stat().st_size
@@ -80,7 +89,12 @@ def _read_other(path: Path) -> FileCheck:
     if suffix == STATE_ENDING:
         return FileCheck(str(path), "Feature Gaussians", len(load_state(path)))
     if path.name == streamed.INDEX:
-        return _read_levels(path)
+        index = streamed.read_index(path)
+        infos = [streamed.read_level(path, level, index).info for level in range(len(index.levels))]
+        # The index counts in the bytes of every level
+        total_bytes = sum(info.file_bytes for info in infos) - (len(infos) - 1) * path.stat().st_size
+        notes = dict.fromkeys(note for info in infos for note in file_notes(info))
+        return FileCheck(str(path), "Gaussians", infos[0].count, infos[0].layout, total_bytes, notes=tuple(notes))
     if suffix == NETWORKS:
         return FileCheck(str(path), "networks", load_checkpoint(path).networks.num_parameters)
     if suffix in CAMERA_FILE_ENDINGS:
@@ -93,24 +107,3 @@ def _read_other(path: Path) -> FileCheck:
         raise ply.no_ply_error(path)
     endings = ", ".join(dict.fromkeys((*READ_ENDINGS, *CAMERA_FILE_ENDINGS, NETWORKS)))
     raise SceneError(path, f"expected one of {endings}, found another kind of file")
-
-
-def _read_scene(path: Path, opacity: OpacityChoice, hints: ReadHints) -> FileCheck:
-    """Read the Gaussians of a scene, with the cameras and photos that belong to them."""
-    load = load_files(find_scene_files(path), opacity=opacity, hints=hints)
-    info, images = load.info, load.scene.images
-    notes, num_photos = (*load.notes, *degree_notes(info)), 0 if images is None else len(images)
-    return FileCheck(
-        str(path), "Gaussians", info.count, info.layout, info.file_bytes, notes=notes,
-        num_views=len(load.scene), num_photos=num_photos,
-    )  # fmt: skip
-
-
-def _read_levels(path: Path) -> FileCheck:
-    """Read all levels of detail of an index, one after the other."""
-    index = streamed.read_index(path)
-    infos = [streamed.read_level(path, level, index).info for level in range(len(index.levels))]
-    # The index counts in the bytes of every level
-    total_bytes = sum(info.file_bytes for info in infos) - (len(infos) - 1) * path.stat().st_size
-    notes = dict.fromkeys(note for info in infos for note in file_notes(info))
-    return FileCheck(str(path), "Gaussians", infos[0].count, infos[0].layout, total_bytes, notes=tuple(notes))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict
 from typing import Any
@@ -20,7 +20,7 @@ from gsmerge.io.photo_files import photo_array
 from gsmerge.jobs.estimate import estimate, estimate_lines
 from gsmerge.plan import describe_share
 from gsmerge.prepare.compare_photos import compare_photos
-from gsmerge.prepare.confirm_depths import Agreement, confirm_depths
+from gsmerge.prepare.confirm_depths import confirm_depths
 from gsmerge.prepare.place_cameras import add_views
 from gsmerge.prepare.prepare_scene import views_notes, without_repeats
 from gsmerge.prepare.scene_size import unlike_captures
@@ -42,7 +42,7 @@ from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.settings.setting import join_words
 from gsmerge.stages.sky import sky_regions
-from gsmerge.types import PicturedScene, Scene, StrPath
+from gsmerge.types import PicturedScene, StrPath
 
 _OWN = "gsmerge"  # exporter of files that gsmerge wrote
 _FILE_KEYS = (
@@ -108,50 +108,23 @@ def inspect(
         report_progress("inspect: reading", 0, 3)
         ply = read_gaussian_file(files, opacity=opacity, hints=read_hints)
         report_progress("inspect: Gaussians", 1, 3)
-        described = _describe_file(ply) | {"batches": list_batches(files.ply) if files.is_state else []}
+        info, opacities = ply.info, ply.gaussians.opacities[ply.valid]
+        opaque = 0.995  # above this opacity, optical depths are capped
+        saturated = 1e-6  # float32 changes the logit of an opacity that is nearer to 0 or 1 than this
+        described = {
+            **{name: getattr(info, name) for name in _FILE_KEYS},
+            "marks": list(kept_comments(info)),
+            "bytes": info.file_bytes,
+            "extents": extents(ply.gaussians[ply.valid] if info.num_nonfinite else ply.gaussians),
+            "num_opaque": int((opacities >= opaque).sum()),
+            "num_transparent": int((opacities < LEAST_OPACITY).sum()),
+            "num_saturated": int(((opacities <= saturated) | (opacities >= 1 - saturated)).sum()),
+            "batches": list_batches(files.ply) if files.is_state else [],
+        }
         report_progress("inspect: views", 2, 3)
         document: dict[str, Any] = finite(described | _describe_views(ply, files, read_hints))
         document |= note_entries([*document["notes"], *degree_notes(ply.info)])
     return document
-
-
-def _describe_file(ply: GaussianFile) -> dict[str, Any]:
-    """Describe a file of Gaussians, without views."""
-    info, opacities = ply.info, ply.gaussians.opacities[ply.valid]
-    opaque = 0.995  # above this opacity, optical depths are capped
-    saturated = 1e-6  # float32 changes the logit of an opacity that is nearer to 0 or 1 than this
-    return {
-        **{name: getattr(info, name) for name in _FILE_KEYS},
-        "marks": list(kept_comments(info)),
-        "bytes": info.file_bytes,
-        "extents": extents(ply.gaussians[ply.valid] if info.num_nonfinite else ply.gaussians),
-        "num_opaque": int((opacities >= opaque).sum()),
-        "num_transparent": int((opacities < LEAST_OPACITY).sum()),
-        "num_saturated": int(((opacities <= saturated) | (opacities >= 1 - saturated)).sum()),
-    }
-
-
-def _prepare_quietly(scene: Scene) -> tuple[Scene, list[str]]:
-    """Prepare a scene as a run does, without showing its progress.
-
-    Returns the canonical scene with the sizes that a run uses, and a run's notes on sizes and photos.
-    """
-    if len(scene.gaussians) == 0:
-        return scene, []
-    with record_part(silent=True) as record:
-        canonical = canonicalise(add_views(scene))[0]
-        raised = raise_sizes(with_pixels(canonical) if len(scene) else canonical, placed=len(scene) == 0)
-        if raised.images is not None:
-            compare_photos(PicturedScene.with_pictures(raised, raised.images, raised.masks))
-    return raised, record.notes
-
-
-def _describe_auto(scene: Scene, agreement: Agreement | None) -> dict[str, Any] | None:
-    """Describe the number of Gaussians that ``--budget auto`` gives; None if the depths of views cannot be compared."""
-    if agreement is None:
-        return None
-    count = int(agreement.share * scene.num_gaussians)
-    return {"share": agreement.share, "num_gaussians": count, "why": describe_share(agreement)[1]}
 
 
 def _describe_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> dict[str, Any]:
@@ -194,61 +167,68 @@ def _describe_scene(load: Loaded, *, is_result: bool) -> dict[str, Any]:
     """
     scene = load.scene
     distinct = without_repeats(scene)[0]  # each view once, as in a run
-    canonical, run_notes = _prepare_quietly(distinct)
+    # A run prepares the scene in the same way, with these sizes and these notes on sizes and photos
+    canonical, run_notes = distinct, list[str]()
+    if len(distinct.gaussians) > 0:
+        with record_part(silent=True) as record:
+            framed = canonicalise(add_views(distinct))[0]
+            canonical = raise_sizes(with_pixels(framed) if len(distinct) else framed, placed=len(distinct) == 0)
+            if canonical.images is not None:
+                compare_photos(PicturedScene.with_pictures(canonical, canonical.images, canonical.masks))
+        run_notes = record.notes
     agreement, doubt = confirm_depths(canonical), unlike_captures(canonical.gaussians)
     doubts = doubt and Doubt(doubt), agreement.advice if agreement else None
-    return {
+    facts: dict[str, Any] = {
         **note_entries(list(dict.fromkeys(filter(None, [*load.notes, *views_notes(scene), *run_notes, *doubts])))),
         "num_views": len(scene),
         "camera_format": load.cameras and load.cameras.source,
         "coverage": coverage(scene),
-        **_describe_sight(scene),
         "compact": estimate(scene, CompactOptions()),
-        "auto": _describe_auto(distinct, agreement),
         "agreement": agreement and agreement.to_dict(),
-        **(_count_unseen(load) if is_result else _name_exporter(load)),
     }
-
-
-def _describe_sight(scene: Scene) -> dict[str, Any]:
-    """Describe how well colours fit the photos, and in how many photos there is sky; {} without views."""
-    if len(scene) == 0:
-        return {}
-    gaussians, images = scene.gaussians, photo_array(scene.images)
-    sight = check_cameras(gaussians, np.ones(len(gaussians), bool), scene.cameras, images)
-    means = gaussians.means[np.isfinite(gaussians.means).all(1)]
-    return {"sight": asdict(sight), "num_sky_views": len(sky_regions(means, scene.cameras, images))}
-
-
-def _count_unseen(load: Loaded) -> dict[str, Any]:
-    """Count the Gaussians of a result that no view shows; {} if this number would mean nothing.
-
-    The number means nothing without views, or if each pixel has a Gaussian, because Gaussians of overlapping views hide
-    each other.
-    """
-    if len(load.scene) == 0 or load.recovery is not None:
-        return {}
-    return {"num_unseen": int((count_views_in_world(load.scene.gaussians, load.scene.cameras) == 0).sum())}
-
-
-def _name_exporter(load: Loaded) -> dict[str, Any]:
-    """Name the models that may have exported a scene."""
-    is_known = load.recovery is not None or any(exporter.is_marked for exporter in load.exporters)
-    titles = join_words(model.title for exporter in load.exporters for model in exporter.models)
-    return {"exporter": (is_known and titles) or f"not known: {load.info.layout}"}
+    if agreement is not None:  # otherwise the depths of views cannot be compared
+        count = int(agreement.share * distinct.num_gaussians)
+        facts["auto"] = {"share": agreement.share, "num_gaussians": count, "why": describe_share(agreement)[1]}
+    if len(scene) > 0:
+        # How well colours fit the photos, and in how many photos there is sky
+        gaussians, images = scene.gaussians, photo_array(scene.images)
+        sight = check_cameras(gaussians, np.ones(len(gaussians), bool), scene.cameras, images)
+        means = gaussians.means[np.isfinite(gaussians.means).all(1)]
+        facts |= {"sight": asdict(sight), "num_sky_views": len(sky_regions(means, scene.cameras, images))}
+    if not is_result:
+        is_known = load.recovery is not None or any(exporter.is_marked for exporter in load.exporters)
+        titles = join_words(model.title for exporter in load.exporters for model in exporter.models)
+        facts["exporter"] = (is_known and titles) or f"not known: {load.info.layout}"
+    elif len(scene) > 0 and load.recovery is None:
+        # If each pixel had a Gaussian, the number of Gaussians that no view shows would mean nothing, because Gaussians
+        # of overlapping views hide each other
+        facts["num_unseen"] = int((count_views_in_world(scene.gaussians, scene.cameras) == 0).sum())
+    return facts
 
 
 def inspection_lines(scene: Mapping[str, Any]) -> list[str]:
     """Describe the document of :func:`inspect` in lines of text."""
     attributes = ", ".join(f"{name} {human_bytes(size)}" for name, size in scene["bytes_by_attribute"].items())
-    ignored, extent = _ignored(scene), scene["extents"]
+    extent = scene["extents"]
+    used = _CAMERA_ELEMENTS if scene["cameras"] is None and scene["camera_format"] else ()
+    elements = [name for name in scene["extra_elements"] if name not in used]
+    ignored = [*scene["extra_columns"], *(f"element {name}" for name in elements)]
+    batches = []
+    for number, batch in enumerate(scene["batches"], 1):
+        count, before, after = (batch.get(name, 0) for name in ("num_views", "num_input", "num_new"))
+        names = batch["views"]
+        shown = f", {names[0]}{f' to {names[-1]}' if len(names) > 1 else ''}" if names else ""
+        batches.append(f"batch {number:<5}{count} views{shown}; {before:,} -> {after:,} Gaussians")
+    is_inside = scene["num_views"] and set(_CAMERA_ELEMENTS) <= set(scene["extra_elements"])
+    cameras = scene["cameras"] or ("inside the .ply" if is_inside else "none found")
+    cameras += f": {scene['num_views']} ({scene['camera_format']})" if scene["num_views"] else ""
     low, high = (" ".join(f"{value:.4g}" for value in extent[key]) for key in ("box_low", "box_high"))
     lines = [
         f"file       {scene['path']}: {human_bytes(scene['bytes'])} ({attributes})",
         f"layout     {scene['layout']}, {scene['format']}; opacity stored {_ENCODINGS[scene['opacity_encoding']]}",
         f"marks      {'; '.join(scene['marks'])}" if scene["marks"] else "",
         f"exporter   {scene['exporter']}",
-        *_batch_lines(scene["batches"]),
+        *batches,
         f"ignored    {', '.join(ignored)}" if ignored else "",
         f"Gaussians  {scene['count']:,}: {scene['num_nonfinite']} not finite, {scene['num_empty']:,} empty,"
         f" {scene['num_transparent']:,} transparent,"
@@ -265,46 +245,23 @@ def inspection_lines(scene: Mapping[str, Any]) -> list[str]:
         else "",
         f"scales     median {extent['scale_median']:.3g}, largest {extent['scale_max']:.3g} in a scene of"
         f" {extent['diagonal']:.3g}; {100 * extent['share_huge']:.3g} % above a tenth of it",
-        f"cameras    {_describe_cameras(scene)}",
+        f"cameras    {cameras}",
         f"images     {scene['images'] or 'none found'}",
         *_alignment_lines(scene),
         *_coverage_lines(scene),
-        *_agreement_lines(scene),
-        *_new_views_lines(scene),
     ]
+    if agreement := scene["agreement"]:
+        shares = (f"{100 * agreement[key]:.0f} %" for key in ("confirmed", "contradicted", "alone"))
+        lines += ["depth      other views confirm {} of the pixels, contradict {}, do not see {}".format(*shares)]
+    if new := scene["new_views"]:
+        gain = f"{new['low']:+.1f} to {new['high']:+.1f} dB expected against its input"
+        lines += [f"new views  {gain}, which shows them at {new['before']:.1f} dB"]
     run = scene["compact"]
     lines += ["compact    would refuse the scene as it is"] if run is None else estimate_lines(run)
     if auto := scene["auto"]:
         share = f"{100 * auto['share']:.3g} %, {auto['num_gaussians']:,} Gaussians"
         lines += [f"auto       --budget auto takes {share}: {auto['why']}"]
     return [line for line in lines if line] + note_lines(scene["notes"])
-
-
-def _batch_lines(batches: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Describe each batch of a state."""
-    lines = []
-    for number, batch in enumerate(batches, 1):
-        count, before, after = (batch.get(name, 0) for name in ("num_views", "num_input", "num_new"))
-        names = batch["views"]
-        shown = f", {names[0]}{f' to {names[-1]}' if len(names) > 1 else ''}" if names else ""
-        lines.append(f"batch {number:<5}{count} views{shown}; {before:,} -> {after:,} Gaussians")
-    return lines
-
-
-def _ignored(scene: Mapping[str, Any]) -> list[str]:
-    """List the columns and elements of the file that gsmerge does not use."""
-    used = _CAMERA_ELEMENTS if scene["cameras"] is None and scene["camera_format"] else ()
-    elements = [name for name in scene["extra_elements"] if name not in used]
-    return [*scene["extra_columns"], *(f"element {name}" for name in elements)]
-
-
-def _describe_cameras(scene: Mapping[str, Any]) -> str:
-    """Say where the cameras are, their number and their format."""
-    if not scene["num_views"]:
-        return scene["cameras"] or "none found"
-    inside = set(_CAMERA_ELEMENTS) <= set(scene["extra_elements"])
-    where = scene["cameras"] or ("inside the .ply" if inside else "none found")
-    return f"{where}: {scene['num_views']} ({scene['camera_format']})"
 
 
 def _alignment_lines(scene: Mapping[str, Any]) -> list[str]:
@@ -342,23 +299,3 @@ def _coverage_lines(scene: Mapping[str, Any]) -> list[str]:
     if low != high:
         range_text = f"{low} to {high} % of the {unit} per view, least in {views[shares.index(min(shares))]['name']}"
     return [f"coverage   {range_text}; {100 * sight['share_seen']:.0f} % of the Gaussians lie in some picture{colors}"]
-
-
-def _agreement_lines(scene: Mapping[str, Any]) -> list[str]:
-    """Describe the share of pixels whose depth other views confirm."""
-    agreement = scene["agreement"]
-    if agreement is None:
-        return []
-    confirmed, contradicted, alone = (f"{100 * agreement[key]:.0f} %" for key in ("confirmed", "contradicted", "alone"))
-    return [f"depth      other views confirm {confirmed} of the pixels, contradict {contradicted}, do not see {alone}"]
-
-
-def _new_views_lines(scene: Mapping[str, Any]) -> list[str]:
-    """Describe the PSNR that new views are expected to gain in a result, compared with its input."""
-    expected = scene["new_views"]
-    if expected is None:
-        return []
-    return [
-        f"new views  {expected['low']:+.1f} to {expected['high']:+.1f} dB expected against its input, which shows them"
-        f" at {expected['before']:.1f} dB"
-    ]

@@ -116,15 +116,28 @@ def compact_tensors(
         "quats": _copy_rows("quats", quats, 4),
         "scales": _copy_rows("scales", scales, 3),
         "opacities": _copy_rows("opacities", opacities),
-        "sh0": _copy_sh0(sh0, colors),
     }
+    if (sh0 is None) == (colors is None):
+        found = "neither" if sh0 is None else "both"
+        raise SceneError("sh0", f"expected either sh0 or colors, found {found}")
+    if sh0 is not None:
+        columns["sh0"] = _copy_rows("sh0", sh0, 3).reshape(-1, 1, 3)
+    else:
+        rgb = _copy_rows("colors", colors, 3)
+        slack = 1.0  # colours of Gaussians may lie outside [0, 1], but hardly by more than this
+        _expect_unit_range("colors", rgb[np.isfinite(rgb)], slack)
+        columns["sh0"] = rgb_to_sh0(rgb)[:, None]
     columns["shN"] = _copy_harmonics(shN, len(columns["means"]))
     gaussians, valid, notes = _check_gaussians(columns)
     cameras, photos = NO_CAMERAS, None
     if order != "none" or viewmats is not None or images is not None:
         cameras, photos = _check_cameras_and_images(viewmats, Ks, images, shape)
     scene, scene_notes = _combine(gaussians, valid, cameras, photos, names, order)
-    scene_notes += _rotation_notes(scene.gaussians.quats)
+    rotations = scene.gaussians.quats
+    # Quaternions that are computed from matrices rarely have a negative w. The note may be wrong for Depth Anything 3,
+    # where the last column is z and is never negative
+    if rotations[:, 3].min(initial=0) >= 0 > rotations[:, 0].min(initial=0):
+        scene_notes.append("the last column of quats is never negative: if w comes last, pass quats[:, [3, 0, 1, 2]]")
     result = compact(scene, progress=progress, **settings)
     result.report.notes[:0] = notes + scene_notes
     if gaussians.means.dtype == np.float32:
@@ -151,7 +164,12 @@ def _combine(
     if len(views) != len(cameras):
         raise SceneError("names", f"expected {len(cameras)} names, one for each view, found {len(views)}")
     if order == "none":
-        notes = _check_seen(gaussians, valid, cameras, images) if len(cameras) else []
+        notes: list[str] = []
+        if len(cameras) > 0:
+            poses, check, note = choose_poses(gaussians, valid, cameras, photo_array(images), W2C_OPENCV)
+            if poses is not None:  # the poses see the Gaussians only in another convention
+                raise _convention_error(poses.convention, poses.description, check.description)
+            notes = [text for text in (note, None if check.ok else check.description) if text]
         return Scene(gaussians[valid], cameras, images, None, views), notes
     count = len(cameras) * cameras.height * cameras.width
     if len(gaussians) != count:
@@ -201,10 +219,17 @@ def _check_gaussians(columns: dict[str, np.ndarray]) -> tuple[Gaussians, np.ndar
     num_bad = clear_invalid("means", columns_and_mask)
     check_values(columns)
     quats, opacities = columns["quats"], columns["opacities"]
-    _check_lengths(quats[valid])
+    lengths = np.linalg.norm(quats[valid], axis=1)
+    # If many lengths differ from 1, the quats may have another meaning
+    max_difference, max_share = 0.01, 0.01  # at most this share of the lengths may differ from 1 by more than this
+    share = float((np.abs(lengths - 1) > max_difference).mean())
+    if share > max_share:
+        sizes = f"{100 * share:.3g} % with lengths of {lengths.min():.3g} to {lengths.max():.3g}"
+        remedy = "pass torch.nn.functional.normalize(quats, dim=-1)"
+        raise SceneError("quats", f"expected unit quaternions wxyz, found {sizes}", remedy)
     np.clip(opacities, 0, 1, out=opacities)
-    max_difference = 1e-5  # a quaternion is normalised if its length differs from 1 by more
-    rows = np.flatnonzero(np.abs(np.linalg.norm(quats, axis=1) - 1) > max_difference)
+    small_difference = 1e-5  # a quaternion is normalised if its length differs from 1 by more
+    rows = np.flatnonzero(np.abs(np.linalg.norm(quats, axis=1) - 1) > small_difference)
     quats[rows] = normalize(quats[rows])
     quats[(quats == 0).all(1)] = (1, 0, 0, 0)
     notes = [count_words(num_bad, "row", "with NaN or inf, set aside")] if num_bad else []
@@ -212,19 +237,6 @@ def _check_gaussians(columns: dict[str, np.ndarray]) -> tuple[Gaussians, np.ndar
     clear_rows(columns_and_mask, empty)  # these rows are no longer valid
     notes += [count_words(len(empty), "empty row", "at the origin, set aside")] if len(empty) else []
     return Gaussians(**columns), valid, notes
-
-
-def _copy_sh0(sh0: Array | None, colors: Array | None) -> np.ndarray:
-    """Return a copy ``[n,1,3]`` of ``sh0``, or compute it from ``colors``; SceneError unless one of them is given."""
-    if (sh0 is None) == (colors is None):
-        found = "neither" if sh0 is None else "both"
-        raise SceneError("sh0", f"expected either sh0 or colors, found {found}")
-    if sh0 is not None:
-        return _copy_rows("sh0", sh0, 3).reshape(-1, 1, 3)
-    rgb = _copy_rows("colors", colors, 3)
-    slack = 1.0  # colours of Gaussians may lie outside [0, 1], but hardly by more than this
-    _expect_unit_range("colors", rgb[np.isfinite(rgb)], slack)
-    return rgb_to_sh0(rgb)[:, None]
 
 
 def _copy_harmonics(shN: Array | None, n: int) -> np.ndarray:
@@ -238,17 +250,6 @@ def _copy_harmonics(shN: Array | None, n: int) -> np.ndarray:
         problem = f"expected shape [n, k-1, 3] with 3, 8, 15 or 24 coefficients, found {list(shape)}"
         raise SceneError("shN", problem, "pass shN.transpose(-1, -2): each coefficient's colours last" * swapped)
     return _copy_rows("shN", shN, shape[-2], 3)
-
-
-def _check_lengths(quats: np.ndarray) -> None:
-    """Raise SceneError if many quaternions do not have the length 1, because they may have another meaning."""
-    lengths = np.linalg.norm(quats, axis=1)
-    max_difference, max_share = 0.01, 0.01  # at most this share of the lengths may differ from 1 by more than this
-    share = float((np.abs(lengths - 1) > max_difference).mean())
-    if share > max_share:
-        sizes = f"{100 * share:.3g} % with lengths of {lengths.min():.3g} to {lengths.max():.3g}"
-        remedy = "pass torch.nn.functional.normalize(quats, dim=-1)"
-        raise SceneError("quats", f"expected unit quaternions wxyz, found {sizes}", remedy)
 
 
 def _expect_unit_range(name: str, values: np.ndarray, slack: float) -> None:
@@ -274,7 +275,17 @@ def _check_cameras_and_images(
     if viewmats is None or Ks is None:
         raise SceneError("viewmats" if viewmats is None else "Ks", "expected one matrix for each view, found none")
     photos = None if images is None else _to_numpy("images", images)
-    views, height, width = _view_shape(shape, photos)
+    if shape is not None:
+        if len(shape) != 3:
+            raise SceneError("shape", f"expected views, height and width, found {list(shape)}")
+        views, height, width = (int(side) for side in shape)
+    elif photos is None:
+        raise SceneError("shape", "expected the number of views, their height and width, found neither it nor images")
+    else:
+        if photos.ndim < 4 or photos.shape[-1] != 3:
+            raise _image_error(photos, "[V, H, W, 3]")
+        views, height, width = photos.shape[-4:-1]
+    check_image_size("shape", width, height)
     matrices = _to_matrices("viewmats", viewmats, ((3, 4), (4, 4)), views)
     intrinsics = _to_matrices("Ks", Ks, ((3, 3),), views)
     poses = np.tile(np.eye(4), (views, 1, 1))
@@ -310,22 +321,6 @@ def _to_matrices(name: str, values: Any, shapes: Sequence[tuple[int, int]], view
     return array.reshape(views, *array.shape[-2:])
 
 
-def _view_shape(shape: Sequence[int] | None, photos: np.ndarray | None) -> tuple[int, int, int]:
-    """Return the number of views, their height and their width, from ``shape`` or else from the photos."""
-    if shape is not None:
-        if len(shape) != 3:
-            raise SceneError("shape", f"expected views, height and width, found {list(shape)}")
-        views, height, width = (int(side) for side in shape)
-    elif photos is None:
-        raise SceneError("shape", "expected the number of views, their height and width, found neither it nor images")
-    else:
-        if photos.ndim < 4 or photos.shape[-1] != 3:
-            raise _image_error(photos, "[V, H, W, 3]")
-        views, height, width = photos.shape[-4:-1]
-    check_image_size("shape", width, height)
-    return views, height, width
-
-
 def _image_error(photos: np.ndarray, expected: str) -> SceneError:
     """Return the error for images of a wrong shape, with a remedy."""
     is_turned = photos.ndim >= 4 and photos.shape[-3] == 3 != photos.shape[-1]
@@ -359,25 +354,6 @@ def _check_pixels(
     if moved is not None:
         return moved.cameras, [moved.note]
     raise misalignment_error("means", alignment, reason)
-
-
-def _rotation_notes(quats: np.ndarray) -> list[str]:
-    """Return a note if w may be the last column of the quaternions, because this column alone has no negative number.
-
-    Quaternions that are computed from matrices rarely have a negative w. The note may be wrong for Depth Anything 3,
-    where the last column is z and is never negative.
-    """
-    if not quats[:, 3].min(initial=0) >= 0 > quats[:, 0].min(initial=0):
-        return []
-    return ["the last column of quats is never negative: if w comes last, pass quats[:, [3, 0, 1, 2]]"]
-
-
-def _check_seen(gaussians: Gaussians, valid: np.ndarray, cameras: Cameras, images: np.ndarray | None) -> list[str]:
-    """Raise SceneError if the poses see the Gaussians only in another convention; otherwise return notes of doubt."""
-    poses, check, note = choose_poses(gaussians, valid, cameras, photo_array(images), W2C_OPENCV)
-    if poses is not None:
-        raise _convention_error(poses.convention, poses.description, check.description)
-    return [text for text in (note, None if check.ok else check.description) if text]
 
 
 def _convention_error(convention: Convention, description: str, fact: str) -> SceneError:

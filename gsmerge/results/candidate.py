@@ -35,7 +35,12 @@ def score(fitted: Fitted, prepared: Prepared, plan: Plan, count: int | None = No
     moved = with_moved_views(prepared, fitted.cameras)
     gaussians, cameras = moved.frame.leave(fitted.gaussians), moved.input_scene.cameras
     if cameras is not prepared.input_scene.cameras:
-        _record_moves(prepared, cameras, plan)
+        input_scene = prepared.input_scene
+        cause = "poses are free" if plan.free_poses else "the photos of some views agree only under other poses"
+        depth = scene_depth(prepared.scene) * prepared.frame.unit
+        moves = list_moves(input_scene.names, input_scene.cameras.viewmats, cameras.viewmats, depth)
+        record_choices(poses=moves)
+        note(f"{cause}: cameras were moved by {describe_moves(moves)}")
     psnr, deciding_psnr = _measure_candidate(gaussians, moved, plan)
     return Candidate(count, fitted, gaussians, cameras, psnr, current_record(), deciding_psnr)
 
@@ -55,7 +60,11 @@ def _measure_candidate(gaussians: Gaussians, moved: Prepared, plan: Plan) -> tup
     are None without photos and renders. ``moved`` is the scene with the cameras of the fit.
     """
     if moved.reference.name == RENDERS:
-        fidelity = _measure_fidelity(moved.frame.enter(round_for_output(gaussians, plan)), moved, plan)
+        canonical = moved.frame.enter(round_for_output(gaussians, plan))
+        with stage("score"):
+            compared = measure_renders(canonical, moved, plan)
+        # If the input leaves gaps, only the pixels that it covers count
+        fidelity = compared.psnr if plan.covered is None else compared.covered_psnr
         views, placed = len(plan.scored_views), moved.reference.placed
         record_choices(fidelity={"psnr": fidelity, "views": views, "held_out": placed})
         return fidelity, fidelity
@@ -66,16 +75,6 @@ def _measure_candidate(gaussians: Gaussians, moved: Prepared, plan: Plan) -> tup
         scored_views=len(plan.scored_views), scored_all=not plan.samples and plan.scored_views == own_views(moved)
     )
     return measured.psnr, measured.psnr if compares_all_pixels(plan.before) else measured.covered_psnr
-
-
-@stage("score")
-def _measure_fidelity(gaussians: Gaussians, prepared: Prepared, plan: Plan) -> float:
-    """Return the mean PSNR (dB), at most 120, of canonical Gaussians against renders of the input.
-
-    If the input leaves gaps, only the pixels that it covers count.
-    """
-    measured = measure_renders(gaussians, prepared, plan)
-    return measured.psnr if plan.covered is None else measured.covered_psnr
 
 
 def with_moved_views(prepared: Prepared, cameras: Cameras) -> Prepared:
@@ -89,13 +88,3 @@ def with_moved_views(prepared: Prepared, cameras: Cameras) -> Prepared:
     if input_cameras is prepared.input_scene.cameras:
         return prepared
     return replace(prepared, input_scene=replace(prepared.input_scene, cameras=input_cameras))
-
-
-def _record_moves(prepared: Prepared, cameras: Cameras, plan: Plan) -> None:
-    """Record how far the fit moved each camera, in the world, and add a note."""
-    input_scene = prepared.input_scene
-    cause = "poses are free" if plan.free_poses else "the photos of some views agree only under other poses"
-    depth = scene_depth(prepared.scene) * prepared.frame.unit
-    moves = list_moves(input_scene.names, input_scene.cameras.viewmats, cameras.viewmats, depth)
-    record_choices(poses=moves)
-    note(f"{cause}: cameras were moved by {describe_moves(moves)}")

@@ -6,8 +6,6 @@ itself a larger error than the input, by the triangle inequality. This test find
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from gsmerge.fit.outside import outside_cameras, sample_gaussians
@@ -51,7 +49,11 @@ def describe_clear_loss(gaussians: Gaussians, prepared: Prepared) -> str | None:
     share = DISTANCE_PIXELS / max(DISTANCE_PIXELS, scene.cameras.width, scene.cameras.height)
     size = [max(1, round(side * share)) for side in (scene.cameras.width, scene.cameras.height)]
     sample, cameras = sample_gaussians(scene, DISTANCE_GAUSSIANS), resize_cameras(scene.cameras, *size)
-    between = _place_between(sample, cameras, views)
+    between = between_cameras(cameras[list(views)]) if len(views) > 1 else cameras[[]]
+    if len(between) > 0:
+        between = between[even_views(len(between), min(len(between), MOST_BETWEEN))]
+    else:  # all views have the same place, so the cameras are placed beside them
+        between = outside_cameras(sample.means, cameras, MOST_BETWEEN, OUTSIDE_LOW, OUTSIDE_HIGH)
     psnr_to_input = _measure_psnr(sample, between, render(gaussians, between).images, None)
     if not psnr_to_input < WRONG_DB:  # most results look right, so the photos need not be read
         return None
@@ -64,14 +66,6 @@ def describe_clear_loss(gaussians: Gaussians, prepared: Prepared) -> str | None:
         "between the views, pictures of the result differ from pictures of the input more than twice as much as these"
         f" differ from the photos: {psnr_to_input:.1f} dB, {input_psnr:.1f} dB"
     )
-
-
-def _place_between(sample: Gaussians, cameras: Cameras, views: Sequence[int]) -> Cameras:
-    """Place a few cameras between the views, or beside them if all views have the same place."""
-    between = between_cameras(cameras[list(views)]) if len(views) > 1 else cameras[[]]
-    if len(between) == 0:
-        return outside_cameras(sample.means, cameras, MOST_BETWEEN, OUTSIDE_LOW, OUTSIDE_HIGH)
-    return between[even_views(len(between), min(len(between), MOST_BETWEEN))]
 
 
 def _measure_psnr(gaussians: Gaussians, cameras: Cameras, pictures: np.ndarray, masks: np.ndarray | None) -> float:

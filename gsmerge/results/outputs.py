@@ -70,6 +70,12 @@ def pad_harmonics(gaussians: Gaussians, count: int) -> Gaussians:
     return replace(gaussians, shN=np.pad(gaussians.shN, ((0, 0), (0, missing), (0, 0))))
 
 
+def join_gaussians(parts: Sequence[Gaussians]) -> Gaussians:
+    """Join Gaussians of one world frame. Harmonics are padded with zeros to the highest degree of all parts."""
+    num_higher = max(gaussians.shN.shape[1] for gaussians in parts)
+    return parts[0] if len(parts) == 1 else Gaussians.concat([pad_harmonics(part, num_higher) for part in parts])
+
+
 def settings_for(outputs: Outputs, settings: CompactOptions, *, has_levels: bool = True) -> CompactOptions:
     """Return the settings of a run with the name of its output, because a budget may count the bytes of this file.
 
@@ -109,15 +115,20 @@ def write_outputs(outputs: Outputs, contents: Contents) -> int:
 def add_outputs(add: AddOutput, outputs: Outputs, temporary: Path, contents: Contents) -> dict[Path, list[Path]]:
     """Write the files of an output in a block of :func:`atomic_outputs`; return the temporary files of each level.
 
-    ``add`` comes from the block, and ``temporary`` is the path that ``add`` has returned for the result. Viewers of
-    some formats start at the first camera in the file, or in a file of settings beside it. If the scene has no camera,
-    one is placed for these viewers. A file of settings that exists already stays unchanged, unless gsmerge wrote it and
-    may overwrite files.
+    ``add`` comes from the block, and ``temporary`` is the path that ``add`` has returned for the result. Results in
+    several formats share one file of cameras. An existing file with the same cameras, to within rounding, stays
+    unchanged, and UsageError is raised if it has other cameras. Viewers of some formats start at the first camera in
+    the file, or in a file of settings beside it. If the scene has no camera, one is placed for these viewers. A file of
+    settings that exists already stays unchanged, unless gsmerge wrote it and may overwrite files.
     """
     format_, gaussians, has_views = outputs.format, contents.levels[0], len(contents.cameras) > 0
     contents = replace(contents, options=outputs.options)
     if outputs.viewer_cameras is not None and has_views:
-        _add_cameras(add, outputs.viewer_cameras, contents, overwrite=outputs.overwrite)
+        if outputs.overwrite or not outputs.viewer_cameras.exists():
+            content = viewer_cameras(contents.cameras, contents.names)
+            add(outputs.viewer_cameras).write_bytes(content.encode())
+        else:
+            refuse_to_replace_cameras(outputs.viewer_cameras, contents.cameras, contents.names)
     if format_.first_view and outputs.options.viewer_cameras:
         if not has_views:
             contents = replace(contents, cameras=place_viewpoints(gaussians)[:1])
@@ -144,39 +155,20 @@ def frame_notes(outputs: Outputs, cameras: Cameras) -> list[str]:
     return notes
 
 
-def _add_cameras(add: AddOutput, path: Path, contents: Contents, *, overwrite: bool) -> None:
-    """Write the file of cameras for viewers in a block of :func:`atomic_outputs`.
-
-    Results in several formats share one file of cameras. An existing file with the same cameras, to within rounding,
-    stays unchanged. Raises UsageError if the file has other cameras.
-    """
-    cameras, names = contents.cameras, contents.names
-    if overwrite or not path.exists():
-        add(path).write_bytes(viewer_cameras(cameras, names).encode())
-    else:
-        refuse_to_replace_cameras(path, cameras, names)
-
-
 def refuse_to_replace_cameras(path: Path, cameras: Cameras, names: Sequence[str], *, moved: bool = False) -> None:
     """Raise UsageError if an existing file has other cameras than these, to within rounding.
 
     If ``moved``, poses are not compared, because the run may still move these cameras.
     """
-    if not _has_cameras(path, cameras, names, moved=moved):
-        remedy = "name another output, or pass --overwrite to replace it"
-        raise UsageError(f"{path}: exists already, with other cameras than this result's; {remedy}")
-
-
-def _has_cameras(path: Path, cameras: Cameras, names: Sequence[str], *, moved: bool) -> bool:
-    """Return whether a file can be read and has these cameras; poses are not compared if the run ``moved`` them."""
-    with suppress(SceneError):
+    is_same = False
+    with suppress(SceneError):  # a file that cannot be read has no cameras
         file, farthest = read_cameras(path), np.abs(cameras.viewmats[:, :3, 3]).max(initial=1)
         stored = to_cameras(file)
         same_views = [*file.names, stored.width, stored.height] == [*names, cameras.width, cameras.height]
         same_poses = same_views and (
             moved or np.allclose(stored.viewmats, cameras.viewmats, rtol=0, atol=CAMERA_TOLERANCE * farthest)
         )
-        return bool(
-            same_poses and np.allclose(stored.Ks, cameras.Ks, rtol=CAMERA_TOLERANCE, atol=100 * CAMERA_TOLERANCE)
-        )
-    return False
+        is_same = same_poses and np.allclose(stored.Ks, cameras.Ks, rtol=CAMERA_TOLERANCE, atol=100 * CAMERA_TOLERANCE)
+    if not is_same:
+        remedy = "name another output, or pass --overwrite to replace it"
+        raise UsageError(f"{path}: exists already, with other cameras than this result's; {remedy}")

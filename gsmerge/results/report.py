@@ -133,7 +133,17 @@ class CompactReport:
     is_far: bool = False
 
     def __repr__(self) -> str:
-        return f"CompactReport({'; '.join(f'{name} {value}' for name, value in self._facts())})"
+        share = human_share(self.num_output / max(1, self.num_input))
+        facts = [f"Gaussians {self.num_input:,} -> {self.num_output:,} ({share})"]
+        if new := self.new_views:
+            facts += [f"PSNR of new views, expected {new.low:+.1f} to {new.high:+.1f} dB from {new.before:.1f} dB"]
+        if self.psnr_before is not None and self.psnr_after is not None:
+            ends = (psnr_figure(psnr, self.choices) for psnr in (self.psnr_before, self.psnr_after))
+            facts += [f"PSNR of its own views {' -> '.join(ends)}"]
+        if fidelity := self.choices.get("fidelity"):
+            facts += [f"PSNR {psnr_words(fidelity['psnr'])} {_describe_fidelity_views(fidelity)}"]
+        facts += [f"time {sum(self.seconds.values()):.1f} s"]
+        return f"CompactReport({'; '.join(facts)})"
 
     @property
     def doubts(self) -> list[str]:
@@ -147,19 +157,6 @@ class CompactReport:
     def to_dict(self) -> dict[str, Any]:
         """Return the report as plain JSON types, by the names of its fields, with ``doubts``."""
         return asdict(self) | {"doubts": self.doubts}
-
-    def _facts(self) -> list[tuple[str, str]]:
-        """Return the main facts for ``repr``, each with its name."""
-        share = human_share(self.num_output / max(1, self.num_input))
-        facts = [("Gaussians", f"{self.num_input:,} -> {self.num_output:,} ({share})")]
-        if new := self.new_views:
-            facts += [("PSNR of new views, expected", f"{new.low:+.1f} to {new.high:+.1f} dB from {new.before:.1f} dB")]
-        if self.psnr_before is not None and self.psnr_after is not None:
-            ends = (psnr_figure(psnr, self.choices) for psnr in (self.psnr_before, self.psnr_after))
-            facts += [("PSNR of its own views", " -> ".join(ends))]
-        if fidelity := self.choices.get("fidelity"):
-            facts += [("PSNR", f"{psnr_words(fidelity['psnr'])} {_describe_fidelity_views(fidelity)}")]
-        return [*facts, ("time", f"{sum(self.seconds.values()):.1f} s")]
 
 
 def report_document(
@@ -238,24 +235,32 @@ def _file_facts(path: Path, report: CompactReport, at: Mapping[Path, Sequence[Pa
     return {"path": os.fspath(path), "bytes": num_bytes, "num_gaussians": report.num_output}
 
 
-def result_facts(document: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
-    """Return the rows of the table of a result: a name, the value before and after, and a short explanation."""
+def result_table(document: Mapping[str, Any], next_step: str | None = None, *, columns: int | None = None) -> list[str]:
+    """Return the lines that ``compact`` prints at its end: the path, a table, and the command to run next, if any.
+
+    Lines are broken at ``columns`` characters, except for paths and ``next_step``, which people copy.
+    """
     files, psnr, choices = (document["input"], document["output"]), document["psnr_input_views"], document["choices"]
+    reference = document.get("psnr_reference")
+    pictures = "its own photos" if reference in (None, "photos") else str(reference)  # to which the result was fitted
+    # A row has a name, the value before and after, and a short explanation
     counts, sizes = [f"{file['num_gaussians']:,}" for file in files], [human_bytes(file["bytes"]) for file in files]
     rows = [("Gaussians", counts[0], counts[1], human_share(document["ratio"])), ("file", sizes[0], sizes[1], "")]
     if new := document["new_views"]:
         gain = f"{new['low']:+.1f} to {new['high']:+.1f} dB expected, from {new['views']} photos left out"
         rows += [("new views", f"{new['before']:.1f} dB", f"{new['after']:.1f} dB", gain)]
+    on_files = document.get("psnr_photo_files")
+    if on_files and psnr["after"] is not None and all(f"{on_files[name]:.2f}" == f"{psnr[name]:.2f}" for name in psnr):
+        on_files = None  # both numbers are printed equal to the PSNR on the changed photos
     scores = {
         "all of them" if choices.get("scored_all") else "by a sample": None if None in psnr.values() else psnr,
         "on the {:.0f} % that the input covers": document["psnr_covered"],
-        "on its photos as their files have them": _scores_on_files(document),
+        "on its photos as their files have them": on_files,
         "on the {:.1f} % that are protected": document.get("psnr_protected"),
     }
     for words, score in scores.items():
         if score:
-            name = _name_pictures(document) if score is psnr else ""
-            about = words.format(100 * score.get("share", 0))
+            name, about = pictures if score is psnr else "", words.format(100 * score.get("share", 0))
             rows += [(name, psnr_figure(score["before"], choices), psnr_figure(score["after"], choices), about)]
     if fidelity := choices.get("fidelity"):
         rows += [("PSNR", "", psnr_words(fidelity["psnr"]), _describe_fidelity_views(fidelity))]
@@ -263,21 +268,18 @@ def result_facts(document: Mapping[str, Any]) -> list[tuple[str, str, str, str]]
         rows += [("not used", "", f"{pruned:,}", "Gaussians of the limit: no view shows more")]
     longest = sorted(document["seconds"].items(), key=lambda item: -item[1])[:2]
     stages = ", ".join(f"{name} {seconds:.1f}" for name, seconds in longest)
-    return [*rows, ("time", "", seconds_line(document), f"most in {stages}")]
-
-
-def result_table(document: Mapping[str, Any], next_step: str | None = None, *, columns: int | None = None) -> list[str]:
-    """Return the lines that ``compact`` prints at its end: the path, a table, and the command to run next, if any.
-
-    Lines are broken at ``columns`` characters, except for paths and ``next_step``, which people copy.
-    """
-    rows = result_facts(document)
+    rows += [("time", "", seconds_line(document), f"most in {stages}")]
     figures = text_table([row[:3] for row in rows], "  ")
     # a broken line continues in the column of its explanation or, in a narrow terminal, in the column of its first
     # value
     indent = len(figures[0]) + 2 if (columns or 80) > 2 * len(figures[0]) + 4 else 13
     lines = [(f"{left}  {row[3]}".rstrip(), indent) for left, row in zip(figures, rows, strict=True)]
-    lines += [(line, 2) for line in (*level_lines(document), *curve_lines(document))]
+    for level in document["levels"]:
+        text = f"{level['path']}: {level['num_gaussians']:,} Gaussians, {human_bytes(level['bytes'])}"
+        if level["psnr_input_views"] is not None:
+            text += f"; {pictures} {psnr_figure(level['psnr_input_views'], level['choices'])}"
+        lines.append((f"{text}; {level['seconds']:.1f} s", 2))
+    lines += [(line, 2) for line in curve_lines(document)]
     wrapped = [part for line, indent in lines for part in wrap_line(line, columns, indent)]
     last_texts = {"cameras": document.get("viewer_cameras"), "next": next_step}
     last_lines = [f"  {name:9}  {text}" for name, text in last_texts.items() if text is not None]
@@ -287,20 +289,6 @@ def result_table(document: Mapping[str, Any], next_step: str | None = None, *, c
 def _describe_fidelity_views(fidelity: Mapping[str, Any]) -> str:
     """Name the views in which the PSNR against the input was measured."""
     return f"from the input in {fidelity['views']} {'held-out' if fidelity['held_out'] else 'of its'} views"
-
-
-def level_lines(document: Mapping[str, Any]) -> list[str]:
-    """Return one line of text for each coarser level of detail."""
-    return [
-        f"{level['path']}: {level['num_gaussians']:,} Gaussians, {human_bytes(level['bytes'])}"
-        + (
-            f"; {_name_pictures(document)} {psnr_figure(level['psnr_input_views'], level['choices'])}"
-            if level["psnr_input_views"] is not None
-            else ""
-        )
-        + f"; {level['seconds']:.1f} s"
-        for level in document["levels"]
-    ]
 
 
 def curve_lines(document: Mapping[str, Any]) -> list[str]:
@@ -324,20 +312,3 @@ def curve_lines(document: Mapping[str, Any]) -> list[str]:
     num_photos = document["choices"].get("curve_left_out")
     scored_on = count_words(num_photos, "photo") if num_photos else "patches of the photos"
     return [f"short fits compare counts, on {scored_on} that they left out:", head, *rows]
-
-
-def _scores_on_files(document: Mapping[str, Any]) -> Mapping[str, float] | None:
-    """Return the PSNR on the photos as they are in their files, before and after.
-
-    None if both numbers are printed equal to the PSNR on the changed photos.
-    """
-    on_files, own = document.get("psnr_photo_files"), document["psnr_input_views"]
-    if on_files is None or own["after"] is None or any(f"{on_files[name]:.2f}" != f"{own[name]:.2f}" for name in own):
-        return on_files
-    return None
-
-
-def _name_pictures(document: Mapping[str, Any]) -> str:
-    """Return words for the pictures that a result was fitted to, such as "its own photos"."""
-    reference = document.get("psnr_reference")
-    return "its own photos" if reference in (None, "photos") else str(reference)

@@ -95,17 +95,6 @@ def _score_photos(
         return score_photos(gaussians, photos, plan.scored_views, every=every, near=near, covered=covered)
 
 
-def _measure_covered(before: PhotoScore | None, gaussians: Gaussians, prepared: Prepared, plan: Plan) -> Covered | None:
-    """Return the PSNR of input and result over the pixels that the input covers; ``before`` is the input's score.
-
-    None if the input covers nearly all pixels, or if the masks of the photos leave out all uncovered pixels anyway.
-    """
-    if before is None or compares_all_pixels(before) or prepared.scene.empty is not None:
-        return None
-    after = measure_result(gaussians, prepared, plan, before.covered)
-    return None if after is None else Covered(before.share, before.covered_psnr, after.covered_psnr)
-
-
 def _measure_on_files(gaussians: Gaussians, prepared: Prepared, plan: Plan) -> float | None:
     """Return the PSNR (dB) of Gaussians of the world on the photos as they are in their files.
 
@@ -172,7 +161,13 @@ def measure_parts(before: InputScores, gaussians: Gaussians, prepared: Prepared,
 
     ``before`` has the scores of the input, which are returned together with the scores of the result.
     """
-    parts = PartScores(_measure_covered(before.photos, gaussians, prepared, plan))
+    parts, photos = PartScores(), before.photos
+    # The covered pixels have no score of their own if the input covers nearly all pixels, or if the masks of the photos
+    # leave out all uncovered pixels anyway
+    if photos is not None and not compares_all_pixels(photos) and prepared.scene.empty is None:
+        covered = measure_result(gaussians, prepared, plan, photos.covered)
+        if covered is not None:
+            parts = PartScores(Covered(photos.share, photos.covered_psnr, covered.covered_psnr))
     rounded = round_for_output(gaussians, plan)
     if before.on_files is not None and (after := _measure_on_files(rounded, prepared, plan)) is not None:
         parts = replace(parts, photo_files=PhotoFiles(before.on_files, after))

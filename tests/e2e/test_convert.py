@@ -23,8 +23,8 @@ from gsmerge.io.cameras.viewer_cameras import viewer_cameras, viewer_cameras_pat
 from gsmerge.io.formats import table as formats
 from gsmerge.io.formats.streamed import read_index, read_level
 from gsmerge.io.formats.table import Contents, Format
-from gsmerge.jobs.convert import ConvertOptions, convert_files, find_placement, join_gaussians, rotation_between
-from gsmerge.results.outputs import name_outputs
+from gsmerge.jobs.convert import ConvertOptions, convert_files, find_placement, rotation_between
+from gsmerge.results.outputs import join_gaussians, name_outputs
 from gsmerge.settings.files import AXES, PlacementOptions
 from gsmerge.settings.stages import CleanOptions
 from gsmerge.types import Gaussians

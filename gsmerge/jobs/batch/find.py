@@ -119,20 +119,18 @@ def _require_some(scenes: Iterator[NamedScene], argument: str, where: str) -> It
     """
     first_scene = next(scenes, None)
     if first_scene is None:
-        raise SceneError(argument, f"expected scenes {where}, found none", _remedy(Path(argument)))
+        remedy = ""
+        if os.path.isdir(argument):
+            file = next(iter(list_plys(Path(argument))), None)
+            if file is None:
+                remedy = find_remedy(Path(argument))
+            elif file.suffix == ".ply":  # the search leaves out a .ply only if it is a result
+                remedy = f"{file} is a result of gsmerge; name this file to compact it"
+            else:
+                remedy = f"name {file}"
+        raise SceneError(argument, f"expected scenes {where}, found none", remedy)
     yield first_scene
     yield from scenes
-
-
-def _remedy(folder: Path) -> str:
-    """Return what the user can do about a folder without a scene, or an empty text if the path is no folder."""
-    if not os.path.isdir(folder):
-        return ""
-    file = next(iter(list_plys(folder)), None)
-    if file is None:
-        return find_remedy(folder)
-    is_result = file.suffix == ".ply"  # the search leaves out a .ply only if it is a result
-    return f"{file} is a result of gsmerge; name this file to compact it" if is_result else f"name {file}"
 
 
 @dataclass

@@ -170,8 +170,11 @@ def find_jobs(
     if options.settings.checkpoint not in CHECKPOINTS:
         load_checkpoint(options.settings.checkpoint)  # fail once, not for each scene
     call = CompactCall(options.settings, options.opacity, options.hints)
-    for name in PLACE_OPTIONS:
-        _check_place(name, getattr(options, name))
+    patterns = {name: getattr(options, name) for name in PLACE_OPTIONS}
+    for name, place in patterns.items():  # a missing path for all scenes fails here, because each scene would fail
+        if place not in (None, NONE) and "{" not in place and not os.path.exists(place):
+            remedy = f"for one beside each scene pass --{name} '{{parent}}/{place}'"
+            raise SceneError(place, "no such file or folder", "" if os.path.isabs(place) else remedy)
     jobs: list[Job] = []
     scenes_by_output: dict[str, list[str]] = {}  # name of an output -> the scenes whose results would have it
     inputs: set[str] = set()  # real paths of the scenes' main files
@@ -181,10 +184,11 @@ def find_jobs(
         if real_path in inputs or real_path in results:
             continue
         inputs.add(real_path)
-        outputs = _output_names(options, scene, len(jobs))
+        output = output_name(options, scene, len(jobs))
+        levels = range(1, options.settings.budget.levels)
+        outputs = output, *(level_output(Path(output), level).as_posix() for level in levels)
         for name in outputs:  # on Windows A.ply and a.ply are one file
             scenes_by_output.setdefault(os.path.normcase(name), []).append(str(scene))
-        patterns = {name: getattr(options, name) for name in PLACE_OPTIONS}
         places: dict[str, Any] = {
             name: pattern if pattern == NONE else fill_template(pattern, scene) for name, pattern in patterns.items()
         }
@@ -206,21 +210,6 @@ def _find_clash(
         if os.path.realpath(out / name) in inputs:
             return f"{out / name}: is one of the scenes and would be replaced; name another --output"
     return None
-
-
-def _check_place(option: str, place: str | None) -> None:
-    """Raise SceneError if an option names a missing path for all scenes, because each scene would fail."""
-    if place in (None, NONE) or "{" in place or os.path.exists(place):
-        return
-    remedy = f"for one beside each scene pass --{option} '{{parent}}/{place}'"
-    raise SceneError(place, "no such file or folder", "" if os.path.isabs(place) else remedy)
-
-
-def _output_names(options: BatchOptions, scene: Path, index: int) -> tuple[str, ...]:
-    """Return the names of a scene's result and of its coarser levels in the output folder."""
-    name = output_name(options, scene, index)
-    levels = range(1, options.settings.budget.levels)
-    return name, *(level_output(Path(name), level).as_posix() for level in levels)
 
 
 def output_name(options: BatchOptions, scene: Path, index: int) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -59,7 +59,13 @@ class RecordIndex:
             self.end = end
             with suppress(KeyError, TypeError, AttributeError):  # raised for a line that is not a record
                 if line is not None and line["status"] == DONE:
-                    self.results[_text(line["output"])] = _read_result(line)
+                    files = [
+                        {"path": _text(file["path"]), "sha256": file["sha256"], "bytes": file["bytes"]}
+                        for file in line["files"]
+                    ]
+                    doubts, unmet = tuple(map(_text, line.get("doubts", ()))), _text(line.get("unmet") or "") or None
+                    result = DoneResult(_text(line["key"]), files, _text(line["scene"]), doubts, unmet)
+                    self.results[_text(line["output"])] = result
         return self
 
     def paths(self) -> Iterator[str]:
@@ -68,16 +74,6 @@ class RecordIndex:
             for file in result.files:
                 with suppress(ValueError):  # no file can have this name
                     yield os.path.realpath(self.folder / file["path"])
-
-
-def _read_result(line: Mapping[str, Any]) -> DoneResult:
-    """Return the result of a record.
-
-    A damaged record raises KeyError, TypeError or AttributeError.
-    """
-    files = [{"path": _text(file["path"]), "sha256": file["sha256"], "bytes": file["bytes"]} for file in line["files"]]
-    doubts, unmet = tuple(map(_text, line.get("doubts", ()))), _text(line.get("unmet") or "") or None
-    return DoneResult(_text(line["key"]), files, _text(line["scene"]), doubts, unmet)
 
 
 def _text(value: Any) -> str:

@@ -16,7 +16,7 @@ from gsmerge.prepare.confirm_depths import CHANCE_ERRORS, NORMAL_SAMPLES
 from gsmerge.prepare.prepare_scene import Prepared
 from gsmerge.raster.photos import shrink_pictures
 from gsmerge.reading.alignment import check_cameras
-from gsmerge.results.outputs import pad_harmonics
+from gsmerge.results.outputs import join_gaussians
 from gsmerge.road import compact_prepared, plan_run
 from gsmerge.runtime.record import Progress, record_run
 from gsmerge.runtime.threads import use_threads
@@ -89,9 +89,7 @@ def extend(
         result = compact_prepared(prepared, plan)
     notes = split_notes(result.report.notes, "worse")[1]  # only of a final result is it said that it is worse
     notes += [NOT_COMPARED] if before is not None and world == UNKNOWN_WORLD else []
-    parts.append(result.gaussians.numpy())
-    num_higher = max(part.shN.shape[1] for part in parts)
-    gaussians = Gaussians.concat([pad_harmonics(part, num_higher) for part in parts])
+    gaussians = join_gaussians([*parts, result.gaussians.numpy()])
     views = batch_views if before is None else _join_views(before, batch_views)
     new_names = views.names[len(views) - len(batch_views.names) :]  # names of the batch's views in the state
     kept_views = subset(views, choose_distant_views(views.cameras, extend_options.max_views))

@@ -34,7 +34,7 @@ from gsmerge.networks.tokens import GroupFeatures, describe_features, make_group
 from gsmerge.networks.weights import NetworkWeights
 from gsmerge.pipeline import encode_groups
 from gsmerge.plan import make_plan
-from gsmerge.prepare.prepare_scene import Prepared, prepare
+from gsmerge.prepare.prepare_scene import prepare
 from gsmerge.runtime.record import Progress, record_run, stage
 from gsmerge.runtime.threads import use_threads
 from gsmerge.settings.compact import ONE_PIECE, CompactOptions
@@ -140,8 +140,17 @@ def extend_features(
     options = options.with_settings(ONE_PIECE)
     with use_threads(options.threads), record_run(progress) as record:
         prepared = prepare(scene.numpy(), options.prepare, None if state is None else state.frame, outside=False)
-        prepared_scene, world = prepared.scene, _check_world(state, prepared.scene, extend_options)
-        plan = make_plan(prepared, options, None if state is None else _own_checkpoint(state, options))
+        prepared_scene, world, checkpoint = prepared.scene, UNKNOWN_WORLD, None
+        if state is not None:
+            world = compare_worlds(feature_to_gaussians(state.refined), prepared_scene, prepared_scene.gaussians.means)
+            refuse_other_world(world, extend_options)
+            if options.checkpoint != state.checkpoint:
+                raise UsageError(
+                    f"checkpoint {options.checkpoint}: expected the networks that made the state ({state.checkpoint});"
+                    " omit the checkpoint, or begin a new state"
+                )
+            checkpoint = Checkpoint(state.networks, Path(state.checkpoint), __version__, {})
+        plan = make_plan(prepared, options, checkpoint)
         weights = plan.networks
         if weights is None or not weights.options.encoder or not weights.options.makes_children:
             raise UsageError(
@@ -157,7 +166,9 @@ def extend_features(
             saliency = group_saliency(merged, members, pixel_saliency)
             extended = _refine_groups(merged, context, saliency, samples, prepared.frame)
         else:
-            _check_degree(state, scene)
+            degree, expected = scene.gaussians.sh_degree, NUM_HIGHER.index(state.merged.shN.shape[1])
+            if degree != expected:
+                raise UsageError(f"expected harmonics of degree {expected}, as in the state, got {degree}")
             saliency = group_saliency(features, members, pixel_saliency)
             extended = _join_batch(state, features, saliency, context, samples, plan.match)
     numbers = {"num_views": len(prepared_scene), "num_input": scene.num_gaussians, "num_new": len(features)}
@@ -167,7 +178,10 @@ def extend_features(
         sh_degree=scene.gaussians.sh_degree, seconds=record.seconds,
         choices=record.choices | plan.network_facts | {"world": world}, notes=tuple(notes), options=options.to_dict(),
     )  # fmt: skip
-    names = _view_names(state, prepared)
+    input_names = prepared.input_scene.names
+    names = tuple(input_names[prepared.repeated.index(view)] for view in range(len(prepared_scene)))
+    if state is not None:
+        names = append_names(state.names, names)
     return replace(extended, checkpoint=options.checkpoint, names=names), report
 
 
@@ -182,46 +196,6 @@ def _check_options(options: CompactOptions) -> None:
         )
     if options.fit.fit != "none":
         raise UsageError(f"fit {options.fit.fit}: expected none with recipe paper")
-
-
-def _check_degree(state: FeatureState, scene: Scene) -> None:
-    """Raise UsageError if the harmonics of a scene and of a state have different degrees."""
-    degree, expected = scene.gaussians.sh_degree, NUM_HIGHER.index(state.merged.shN.shape[1])
-    if degree != expected:
-        raise UsageError(f"expected harmonics of degree {expected}, as in the state, got {degree}")
-
-
-def _view_names(state: FeatureState | None, prepared: Prepared) -> tuple[str, ...]:
-    """Return the names of all views of a state and a batch."""
-    input_names = prepared.input_scene.names
-    batch_names = tuple(input_names[prepared.repeated.index(view)] for view in range(len(prepared.scene)))
-    return batch_names if state is None else append_names(state.names, batch_names)
-
-
-def _check_world(state: FeatureState | None, scene: Scene, options: ExtendOptions) -> str:
-    """Compare the world of a scene with the world of a state, both in the canonical frame; see :func:`compare_worlds`.
-
-    Raises SceneError if the scene is in another world, unless the options allow this.
-    """
-    if state is None:
-        return UNKNOWN_WORLD
-    world = compare_worlds(feature_to_gaussians(state.refined), scene, scene.gaussians.means)
-    refuse_other_world(world, options)
-    return world
-
-
-def _own_checkpoint(state: FeatureState, options: CompactOptions) -> Checkpoint:
-    """Return the networks of a state as a checkpoint.
-
-    Raises UsageError if the options name other networks.
-    """
-    stored = state.checkpoint
-    if options.checkpoint != stored:
-        raise UsageError(
-            f"checkpoint {options.checkpoint}: expected the networks that made the state ({stored}); omit the"
-            " checkpoint, or begin a new state"
-        )
-    return Checkpoint(state.networks, Path(stored), __version__, {})
 
 
 def sample_fronts(members: Members, cameras: Cameras, state: FeatureState | None) -> ViewSamples:
@@ -290,35 +264,25 @@ def _join_batch(
         part_views=np.concatenate([state.views, views]), part_members=part_members,
         part_weights=np.asarray(parts.weights),
     )  # fmt: skip
-    merged = merge(parts, _match_parts(parts, len(state), options), join_context)
-    part_saliency = np.concatenate([state.saliency, saliency])
-    merged_saliency = _mean_of_parts(merged, part_saliency, part_members.astype(np.float64))
-    return _refine_groups(merged, join_context, merged_saliency, all_samples, state.frame)
-
-
-def _mean_of_parts(merged: FeatureGaussians, values: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return the weighted mean ``[g]`` of ``values [p]`` over the parts of each Feature Gaussian."""
-    owners = np.repeat(np.arange(len(merged)), np.diff(merged.starts))
-    weights, values = weights[merged.members], values[merged.members]
-    return np.bincount(owners, weights * values, len(merged)) / np.bincount(owners, weights, len(merged))
-
-
-def _match_parts(parts: FeatureGaussians, num_old: int, options: MatchOptions) -> Matches:
-    """Match the Feature Gaussians of a batch with each other, as in a scene, and with a state.
-
-    The first ``num_old`` of the ``parts`` come from the state. Clusters of the matching within the batch and of the
-    matching with the state are joined if they share a part. For the matching with the state, all parts of the state
-    count as one view, and all parts of the batch as another. In this way each part of the state is compared with its
-    nearest neighbours in the batch, and vice versa.
-    """
-    rows = np.arange(len(parts))
-    across = match(replace(parts, views=(rows >= num_old).astype(np.int64)), options).clusters
-    batch_views = np.where(rows < num_old, -1, parts.views)
-    batch_extinctions = np.where(rows < num_old, 0, parts.extinctions)
+    # The Feature Gaussians of the batch are matched with each other, as in a scene, and with the state. For the
+    # matching with the state, all parts of the state count as one view, and all parts of the batch as another. In this
+    # way each part of the state is compared with its nearest neighbours in the batch, and vice versa
+    is_new = np.arange(len(parts)) >= len(state)
+    across = match(replace(parts, views=is_new.astype(np.int64)), options)
+    batch_views, batch_extinctions = np.where(is_new, parts.views, -1), np.where(is_new, parts.extinctions, 0)
     within = match(replace(parts, views=batch_views, extinctions=batch_extinctions), options)
-    neighbors = np.stack([_first_members(across), _first_members(within.clusters)], 1)
-    # All scores are set to 1, which is above the threshold, so that all neighbours are connected
-    return Matches(*connected_components(neighbors, np.ones(neighbors.shape), threshold=0.5))
+    # Clusters of both matchings are joined if they share a part. All scores are set to 1, which is above the threshold,
+    # so that all neighbours are connected
+    neighbors = np.stack([_first_members(across.clusters), _first_members(within.clusters)], 1)
+    matches = Matches(*connected_components(neighbors, np.ones(neighbors.shape), threshold=0.5))
+    merged = merge(parts, matches, join_context)
+    # The saliency of a merged Feature Gaussian is the mean over its parts, weighted by their numbers of members
+    owners = np.repeat(np.arange(len(merged)), np.diff(merged.starts))
+    weights = part_members.astype(np.float64)[merged.members]
+    part_saliency = np.concatenate([state.saliency, saliency])[merged.members]
+    total = np.bincount(owners, weights * part_saliency, len(merged))
+    merged_saliency = total / np.bincount(owners, weights, len(merged))
+    return _refine_groups(merged, join_context, merged_saliency, all_samples, state.frame)
 
 
 def _first_members(clusters: np.ndarray) -> np.ndarray:

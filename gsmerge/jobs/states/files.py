@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -85,7 +85,10 @@ def extend_file(
             state, report = extend_state(state, loaded.scene, settings, progress=progress)
         except SceneError as error:
             raise (SceneError(files.ply, error.problem, error.remedy) if error.path == BATCH else error) from error
-        state = _record_source(state, batch_hash, loaded.comments)
+        *earlier, last = state.about["batches"]
+        comments = list(dict.fromkeys([*state.about.get("comments", []), *loaded.comments]))
+        about = {**state.about, "batches": [*earlier, last | {"content": batch_hash}], "comments": comments}
+        state = replace(state, about=about)
         extend_end = perf_counter()
         if not dry_run:
             save_state(path, state, overwrite=True, mode=mode)
@@ -111,14 +114,6 @@ def lock_state(path: Path) -> AbstractContextManager[bool]:
     if not path.parent.is_dir():  # no other process can have a state in a folder that does not exist
         return nullcontext(True)
     return lock_file(path.with_name(f".gsmerge-{digest({'name': path.name})[:16]}.lock"))
-
-
-def _record_source(state: State, batch_hash: str, comments: Sequence[str]) -> State:
-    """Return a state with the hash of the last batch's files, and with ``comments`` from these files."""
-    *earlier, last = state.about["batches"]
-    last = last | {"content": batch_hash}
-    all_comments = list(dict.fromkeys([*state.about.get("comments", []), *comments]))
-    return replace(state, about={**state.about, "batches": [*earlier, last], "comments": all_comments})
 
 
 def _state_facts(path: Path, state: State) -> dict[str, Any]:

@@ -27,9 +27,8 @@ from gsmerge.io.formats.gsm import (
 from gsmerge.jobs.states.features import FeatureState, ViewSamples
 from gsmerge.networks.checkpoint import build_networks
 from gsmerge.networks.options import CORRECTED, GROUP_COLUMNS
-from gsmerge.networks.weights import NetworkWeights
 from gsmerge.reading.read_scene import load_scene
-from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Scene, StrPath
+from gsmerge.types import FeatureGaussians, Gaussians, Scene, StrPath
 
 FEATURE_COLUMNS = tuple(f.name for f in fields(FeatureGaussians) if f.name not in ("starts", "members", "views"))
 _MAX_MEMBERS = (1 << 40) - 1  # most Gaussians of a group; a larger number is damaged
@@ -101,11 +100,18 @@ def holds_features(path: Path) -> bool:
 
 def _read_features(file: GsmFile) -> FeatureState:
     """Read Feature Gaussians, and check type, shape and range of every array."""
-    networks = _read_networks(file)
+    prefix, options = "networks.", file.header.get("networks")
+    if not isinstance(options, dict):
+        raise file.error(f"expected networks in the header, found {options!r:.40}")
+    stored_networks = {name.removeprefix(prefix): a for name, a in file.arrays.items() if name.startswith(prefix)}
+    networks = build_networks(file.path, options, stored_networks)
     unit = file.header.get("unit")
     if not isinstance(unit, float) or not 0 < unit < MAX_NUMBER:
         raise file.error(f"unit: expected a length above 0 and below {MAX_NUMBER:g}, found {unit!r:.40}")
-    cameras = _read_cameras(file)
+    cameras = stored_cameras(file)
+    for view, (viewmat, K) in enumerate(zip(cameras.viewmats, cameras.Ks, strict=True)):
+        check_camera(file.path, str(view), viewmat, K)
+        check_size(file.path, str(view), K, (cameras.width, cameras.height))
     g, num_views = len(file.array("views", np.int64, None)), len(cameras)
     num_higher = file.array("merged.shN", np.float32, g, None, 3).shape[1]
     if num_higher not in NUM_HIGHER:
@@ -121,10 +127,15 @@ def _read_features(file: GsmFile) -> FeatureState:
         members=np.zeros(0, np.int32),
     )
     corrected = {name: _read_bounded_array(file, f"refined.{name}", g, *shapes.get(name, ())) for name in CORRECTED}
+    grid = file.array("samples.opacities", np.float32, num_views, None, None).shape  # views, height and width
+    if 0 in grid[1:]:
+        raise file.error("samples.opacities: expected pixels of every view, found none")
+    sample_shapes = {"means": (3,), "opacities": (), "sh0": (3,)}
+    samples = [_read_bounded_array(file, f"samples.{name}", *grid, *shape) for name, shape in sample_shapes.items()]
     return FeatureState(
         merged=merged,
         refined=replace(merged, **corrected),
-        samples=_read_samples(file, num_views),
+        samples=ViewSamples(*samples),
         views=_read_whole_numbers(file, "views", g, 0, num_views),
         num_members=_read_whole_numbers(file, "num_members", g, 1, _MAX_MEMBERS + 1),
         saliency=file.finite("saliency", np.float64, g),
@@ -135,34 +146,6 @@ def _read_features(file: GsmFile) -> FeatureState:
         checkpoint=str(file.header.get("checkpoint")),
         names=stored_names(file, num_views),
     )
-
-
-def _read_networks(file: GsmFile) -> NetworkWeights:
-    """Read the networks of a state, or raise SceneError if their options or arrays are damaged."""
-    prefix, options = "networks.", file.header.get("networks")
-    if not isinstance(options, dict):
-        raise file.error(f"expected networks in the header, found {options!r:.40}")
-    arrays = {name.removeprefix(prefix): array for name, array in file.arrays.items() if name.startswith(prefix)}
-    return build_networks(file.path, options, arrays)
-
-
-def _read_cameras(file: GsmFile) -> Cameras:
-    """Read the cameras of a state, or raise SceneError if poses, intrinsics or the size are impossible."""
-    cameras = stored_cameras(file)
-    for view, (viewmat, K) in enumerate(zip(cameras.viewmats, cameras.Ks, strict=True)):
-        check_camera(file.path, str(view), viewmat, K)
-        check_size(file.path, str(view), K, (cameras.width, cameras.height))
-    return cameras
-
-
-def _read_samples(file: GsmFile, num_views: int) -> ViewSamples:
-    """Read the Gaussians that were sampled in all views; see :class:`ViewSamples`."""
-    height, width = file.array("samples.opacities", np.float32, num_views, None, None).shape[1:]
-    if 0 in (height, width):
-        raise file.error("samples.opacities: expected pixels of every view, found none")
-    shapes = {"means": (3,), "opacities": (), "sh0": (3,)}
-    grid = num_views, height, width
-    return ViewSamples(*(_read_bounded_array(file, f"samples.{name}", *grid, *shape) for name, shape in shapes.items()))
 
 
 def _read_bounded_array(file: GsmFile, name: str, *shape: int) -> np.ndarray:
