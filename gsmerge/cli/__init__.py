@@ -35,7 +35,20 @@ def main(args: Sequence[str] | None = None) -> int:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # threads of OpenBLAS would spin beside the threads of gsmerge
     gc_thresholds = 200_000, 10, 10  # more than the 115,000 imported objects, where a search for cycles takes 30 ms
     gc.set_threshold(*gc_thresholds)
-    _open_streams()
+    # If the caller closed descriptor 0, 1 or 2, it becomes the null device. If the descriptor stayed closed, the next
+    # file to be opened would get its number, and what a process of a batch prints would go into that file
+    for descriptor in range(3):
+        try:
+            os.fstat(descriptor)
+        except OSError:
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # takes the lowest free descriptor
+    # Stdout and stderr have to exist and to accept any character, since file names may contain any
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # closed by the caller
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 - open until the process ends
+        reconfigure = getattr(getattr(sys, name), "reconfigure", None)
+        if reconfigure is not None:
+            reconfigure(errors="backslashreplace")
     try:
         from gsmerge.cli.app import run
 
@@ -48,25 +61,6 @@ def main(args: Sequence[str] | None = None) -> int:
             problem = f"{error.name} is not installed, but needed; run pip install -e FOLDER on the project's folder"
         print(f"gsmerge: error: {problem}", file=sys.stderr)
         return 1
-
-
-def _open_streams() -> None:
-    """Make sure that stdout and stderr exist and accept any character, since file names may contain any.
-
-    If the caller closed descriptor 0, 1 or 2, it becomes the null device. If the descriptor stayed closed, the next
-    file to be opened would get its number, and what a process of a batch prints would go into that file.
-    """
-    for descriptor in range(3):
-        try:
-            os.fstat(descriptor)
-        except OSError:
-            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # takes the lowest free descriptor
-    for name in ("stdout", "stderr"):
-        if getattr(sys, name) is None:  # closed by the caller
-            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 - open until the process ends
-        reconfigure = getattr(getattr(sys, name), "reconfigure", None)
-        if reconfigure is not None:
-            reconfigure(errors="backslashreplace")
 
 
 def stop_at_once(*_: object) -> NoReturn:

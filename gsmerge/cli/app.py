@@ -190,15 +190,6 @@ def _orderly_stop(signals: list[signal.Signals]) -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def _check_working_directory() -> None:
-    """Raise SceneError if the working directory does not exist, since libraries fail unclearly without it."""
-    try:
-        os.getcwd()
-    except OSError as error:
-        reason = f"the working directory cannot be used ({error.strerror})"
-        raise SceneError(os.curdir, reason, "change to another one") from error
-
-
 def run(args: Sequence[str] | None = None) -> int:
     """Run the application and return its exit code; print an error as one line on stderr."""
     arguments = list(sys.argv[1:] if args is None else args)
@@ -229,7 +220,11 @@ def run(args: Sequence[str] | None = None) -> int:
 
     try:
         with plain_warnings(), _orderly_stop(signals), print_style():
-            _check_working_directory()
+            try:
+                os.getcwd()
+            except OSError as error:  # libraries would fail unclearly without the working directory
+                reason = f"the working directory cannot be used ({error.strerror})"
+                raise SceneError(os.curdir, reason, "change to another one") from error
             words = ["compact", "--open", *words] if words and _names_scene(words[0]) else words
             if words[:1] == ["help"] or words in ([], [LAB]):
                 words = [word for word in (*words, "--help") if word != "help"]

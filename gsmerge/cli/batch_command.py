@@ -94,21 +94,37 @@ def batch(
     if dry_run:
         _print_plan(output, planned, options, notes, as_json=json)
     else:
-        _run(output, planned, options, notes, strict=strict, json=json, quiet=quiet)
+        _run(output, planned, options, notes, strict=strict, as_json=json, quiet=quiet)
 
 
 def _run(
     out: Path, jobs: "Sequence[Job]", options: "BatchOptions", notes: Sequence[str], *,
-    strict: bool, json: bool, quiet: bool,
+    strict: bool, as_json: bool, quiet: bool,
 ) -> None:  # fmt: skip
     """Compact all scenes, print a summary, and raise an error if some failed or missed their target."""
+    from gsmerge.jobs.batch import run_batch
+    from gsmerge.jobs.batch.records import FAILED, SKIPPED
     from gsmerge.jobs.batch.run import choose_concurrency
 
-    totals, silent = Totals(len(jobs)), quiet or json
+    totals, silent = Totals(len(jobs)), quiet or as_json
     say(f"{count_words(len(jobs), 'scene')}, {choose_concurrency(jobs, options)}", quiet=silent)
-
+    stdout = sys.stdout
     try:
-        _run_jobs(out, jobs, options, totals, as_json=json, quiet=silent)
+        with (
+            separate_stdout(options.engine, quiet=silent),
+            closing(run_batch(jobs, out, options)) as records,
+            total_progress(len(jobs), quiet=silent) as progress,
+        ):
+            for num_ended, record in enumerate(records, 1):
+                totals.add(record)
+                if as_json:
+                    print(json.dumps(record, separators=(",", ":")), file=stdout, flush=True)
+                failure, num_skipped, num_failed = record["error"] or "", totals.counts[SKIPPED], totals.counts[FAILED]
+                # skipped scenes take no time, so the time left is estimated without them
+                share = 1.0 if num_ended == len(jobs) else (num_ended - num_skipped) / (len(jobs) - num_skipped)
+                report = record["report"]  # None for a failure, and for a result that was done before
+                record_notes = [Doubt(text) for text in record["doubts"]] if report is None else report["notes"]
+                progress(RunEnd(record["scene"], record["status"], num_ended, failure, num_failed, share, record_notes))
     finally:
         if not silent:
             print_document(
@@ -126,31 +142,6 @@ def _run(
         raise TargetError(f"{len(unmet)} of {results} missed the target{_first_reason(unmet, listed=not silent)}")
     if doubtful and strict:
         raise TargetError(problem)
-
-
-def _run_jobs(
-    out: Path, jobs: "Sequence[Job]", options: "BatchOptions", totals: "Totals", *, as_json: bool, quiet: bool
-) -> None:
-    """Compact the scenes of all jobs, add each record to the totals, and print it with ``--json``."""
-    from gsmerge.jobs.batch import run_batch
-    from gsmerge.jobs.batch.records import FAILED, SKIPPED
-
-    stdout = sys.stdout
-    with (
-        separate_stdout(options.engine, quiet=quiet),
-        closing(run_batch(jobs, out, options)) as records,
-        total_progress(len(jobs), quiet=quiet) as progress,
-    ):
-        for num_ended, record in enumerate(records, 1):
-            totals.add(record)
-            if as_json:
-                print(json.dumps(record, separators=(",", ":")), file=stdout, flush=True)
-            failure, num_skipped = record["error"] or "", totals.counts[SKIPPED]
-            # skipped scenes take no time, so the time left is estimated without them
-            share = 1.0 if num_ended == len(jobs) else (num_ended - num_skipped) / (len(jobs) - num_skipped)
-            report = record["report"]  # None for a failure, and for a result that was done before
-            notes = [Doubt(text) for text in record["doubts"]] if report is None else report["notes"]
-            progress(RunEnd(record["scene"], record["status"], num_ended, failure, totals.counts[FAILED], share, notes))
 
 
 def check_failures(failed: Sequence[tuple[str, str]], total: int, unit: str, *, listed: bool = False) -> None:
@@ -182,19 +173,43 @@ class Totals:
 
     def add(self, record: Mapping[str, Any]) -> None:
         """Add the record of one scene to the totals."""
+        from gsmerge.prepare.row_colors import ROW_COLORS
+        from gsmerge.raster.metrics import MAX_PSNR, psnr_figure
+        from gsmerge.runtime.memory import human_share
+
         report = record["report"]
         reasons = {"doubt": "; also ".join(record["doubts"]), "unmet": record["unmet"], "error": record["error"]}
         if report and not report["input"]["num_photos"] and {*record["doubts"]} <= {report["worse"]}:
-            reasons["lacking"] = _describe_lack(report)
+            if report["input"]["num_views"]:
+                own = report.get("psnr_reference") == ROW_COLORS
+                measured = f"; its numbers are of {ROW_COLORS}" if own else ""
+                lack = f"no photos found beside it or in the named folder{measured}; name them with --images"
+            else:
+                place = "no cameras found beside it or in the named folder"
+                lack = f"{place}; name them with --cameras, and photos with --images"
+            reasons["lacking"] = lack
         for kind, reason in reasons.items():
             if reason:
                 self.reasons[kind].append((record["scene"], reason))
         self.counts[record["status"]] += 1
-        if report:
-            self.counts["in"] += report["input"]["num_gaussians"]
-            self.counts["out"] += report["output"]["num_gaussians"]
-            if len(self.rows) < MAX_LISTED:
-                self.rows.append(_row(record["output"], report))
+        if not report:
+            return
+        self.counts["in"] += report["input"]["num_gaussians"]
+        self.counts["out"] += report["output"]["num_gaussians"]
+        if len(self.rows) >= MAX_LISTED:
+            return
+        psnr = report["psnr_input_views"]
+        quality = [
+            "" if psnr[name] is None else psnr_figure(psnr[name], report["choices"]).removesuffix(" dB")
+            for name in ("before", "after")
+        ]
+        if fidelity := report["choices"].get("fidelity"):
+            # without photos the result is compared with the input
+            quality = ["the input", "equal" if fidelity["psnr"] >= MAX_PSNR else f"{fidelity['psnr']:.2f}"]
+        counts, new = [f"{report[name]['num_gaussians']:,}" for name in ("output", "input")], report["new_views"]
+        gain = "" if new is None else f"{new['low']:+.1f} to {new['high']:+.1f} dB"
+        share, seconds = human_share(report["ratio"]), f"{report['total_seconds']:.1f}"
+        self.rows.append((record["output"], *counts, share, gain, *quality, seconds))
 
     def lines(self, columns: int | None = None) -> list[str]:
         """Return the last lines of a batch: a table of results, reasons of each kind, and a line of totals.
@@ -214,7 +229,14 @@ class Totals:
         )
         lines += [f"... and {self.counts[DONE] - len(self.rows):,} more"] * (self.counts[DONE] > len(self.rows))
         for name, (word, noun) in REASONS.items():
-            grouped = _list_reasons(self.reasons[name])
+            scenes_by_reason: dict[str, list[str]] = {}
+            for scene, reason in self.reasons[name]:
+                scenes_by_reason.setdefault(reason, []).append(scene)
+            grouped = []
+            for reason, (first, *more) in scenes_by_reason.items():
+                others = f" and {count_words(len(more), 'other')}" if more else ""
+                # A reason that begins with the scene's name is a line by itself
+                grouped.append(reason if reason.startswith(first) else f"{first}{others}: {reason}")
             lines += [f"{word}: {line}" for line in grouped[:MAX_LISTED]]
             lines += [f"... and {count_words(len(grouped) - MAX_LISTED, f'more {noun}')}"] * (len(grouped) > MAX_LISTED)
         counts = {status: self.counts[status] for status in (DONE, SKIPPED, FAILED)}
@@ -227,49 +249,6 @@ class Totals:
         for name, words in (("unmet", "missed the target"), ("doubt", "doubtful")):
             total_line += f"; {len(self.reasons[name]):,} {words}" if self.reasons[name] else ""
         return [*lines, total_line]
-
-
-def _list_reasons(reasons: Sequence[tuple[str, str]]) -> list[str]:
-    """Return a line for each reason, such as "first and 3 others: no cameras found".
-
-    A reason that begins with the scene's name is a line by itself.
-    """
-    scenes_by_reason: dict[str, list[str]] = {}
-    for scene, reason in reasons:
-        scenes_by_reason.setdefault(reason, []).append(scene)
-    lines = []
-    for reason, (first, *more) in scenes_by_reason.items():
-        others = f" and {count_words(len(more), 'other')}" if more else ""
-        lines.append(reason if reason.startswith(first) else f"{first}{others}: {reason}")
-    return lines
-
-
-def _describe_lack(report: Mapping[str, Any]) -> str:
-    """Describe which files are missing for a scene without photos, and what its scores are measured on instead."""
-    from gsmerge.prepare.row_colors import ROW_COLORS
-
-    if not report["input"]["num_views"]:
-        return "no cameras found beside it or in the named folder; name them with --cameras, and photos with --images"
-    measured = f"; its numbers are of {ROW_COLORS}" if report.get("psnr_reference") == ROW_COLORS else ""
-    return f"no photos found beside it or in the named folder{measured}; name them with --images"
-
-
-def _row(output: str, report: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the row of the table for a result, by its report."""
-    from gsmerge.raster.metrics import MAX_PSNR, psnr_figure
-    from gsmerge.runtime.memory import human_share
-
-    psnr = report["psnr_input_views"]
-    quality = [
-        "" if psnr[name] is None else psnr_figure(psnr[name], report["choices"]).removesuffix(" dB")
-        for name in ("before", "after")
-    ]
-    if fidelity := report["choices"].get("fidelity"):
-        # without photos the result is compared with the input
-        quality = ["the input", "equal" if fidelity["psnr"] >= MAX_PSNR else f"{fidelity['psnr']:.2f}"]
-    counts, new = [f"{report[name]['num_gaussians']:,}" for name in ("output", "input")], report["new_views"]
-    gain = "" if new is None else f"{new['low']:+.1f} to {new['high']:+.1f} dB"
-    return output, *counts, human_share(report["ratio"]), gain, *quality, f"{report['total_seconds']:.1f}"
 
 
 def _print_plan(

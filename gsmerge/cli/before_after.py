@@ -26,11 +26,10 @@ def lpips_networks(
 
     By default these are the ``usual`` networks that are installed.
     """
-    from gsmerge.scoring.lpips import INSTALL, lpips_available
+    from gsmerge.scoring.lpips import INSTALL, installed_networks, lpips_available
 
     if choice is None:
-        nets = tuple(net for net in usual if lpips_available(net))
-        return nets, [] if nets else [f"LPIPS is left out, since its weights are not installed: {INSTALL}"]
+        return installed_networks(usual)
     nets = {"both": NETS, "none": ()}.get(choice, (choice,))
     if not all(map(lpips_available, nets)):
         raise UsageError(f"--lpips: the weights are not installed: {INSTALL}; or pass --lpips none")

@@ -23,7 +23,6 @@ from gsmerge.settings.stages import Engine
 if TYPE_CHECKING:
     from gsmerge.reading.read_scene import Loaded
     from gsmerge.reading.scene_files import SceneFiles
-    from gsmerge.results.outputs import Outputs
 
 SETTINGS = (CompactOptions, FileOptions, Engine)
 REMEDY = "more Gaussians (--k, --budget) or a longer fit (--effort) show them better"
@@ -71,13 +70,23 @@ def compact(
 ) -> None:  # fmt: skip
     """Write a compact scene that renders like the given one, or better, with 1 to 10 % of its Gaussians."""
     start = perf_counter()
+    from gsmerge.io.formats.table import STATE_ENDING
+
     given = opt.read_settings(
         SETTINGS, set, budget=budget, quality=quality, levels=levels, k=k, effort=effort, fit=fit, crop=crop, drop=drop,
         seed=seed, threads=threads,
     )  # fmt: skip
     settings, writing, engine = given.make(*SETTINGS)
     settings = replace(settings, blocks=replace(settings.blocks, engine=engine))
-    features = _find_features(scenes)
+    # The input may be a .gsm of Feature Gaussians
+    states = [path for path in scenes if path.suffix.lower() == STATE_ENDING and path.is_file()]
+    features = None
+    if states:
+        from gsmerge.jobs.states.state_file import holds_features
+
+        features = next(filter(holds_features, states), None)
+    if features is not None and len(scenes) > 1:
+        raise UsageError(f"{features}: expected Feature Gaussians as the only input, got {len(scenes)} inputs")
     source = features or _find_files(scenes, output, cameras, images=images, masks=masks, protect=protect)
     ply = source if isinstance(source, Path) else source.base
     out = output_file(output or ply.parent, f"{ply.stem}.compact.ply")
@@ -126,7 +135,13 @@ def _compact_files(
     networks = [] if settings.checkpoint in CHECKPOINTS else [Path(settings.checkpoint)]
     check_outputs(written, (*input_files(files), *networks), overwrite=run.overwrite or run.dry_run)
     if run.dry_run:
-        print_estimate(files, settings, outputs, reading, as_json=run.json)
+        from gsmerge.jobs.estimate import dry_run_lines, estimate_files
+        from gsmerge.reading.input import read_input
+
+        load = read_input(files, opacity=reading.opacity, hints=reading.hints)
+        with opt.usage_errors():
+            estimate = estimate_files(load, settings, outputs)
+        print_document(estimate, dry_run_lines(estimate), as_json=run.json)
         return None
     # Warn before reading if the scene, or the largest of its blocks, is not likely to fit into memory
     count, num_rest = estimate_counts([ply for scene_files in (files, *files.more) for ply in scene_files.plys])
@@ -212,21 +227,6 @@ def _decode_features(context: typer.Context, path: Path, given: opt.Given, run: 
     print_document(document, decoding_line(document), as_json=run.json, quiet=run.quiet and not run.dry_run)
 
 
-def _find_features(scenes: Sequence[Path]) -> Path | None:
-    """Return the input if it is a ``.gsm`` of Feature Gaussians; UsageError if it is one of several inputs."""
-    from gsmerge.io.formats.table import STATE_ENDING
-
-    states = [path for path in scenes if path.suffix.lower() == STATE_ENDING and path.is_file()]
-    if not states:
-        return None
-    from gsmerge.jobs.states.state_file import holds_features
-
-    path = next(filter(holds_features, states), None)
-    if path is not None and len(scenes) > 1:
-        raise UsageError(f"{path}: expected Feature Gaussians as the only input, got {len(scenes)} inputs")
-    return path
-
-
 def _find_files(scenes: Sequence[Path], output: Path | None, cameras: Any, **named: Any) -> "SceneFiles":
     """Find the files of a scene, and of further scenes to join with it: those named, or those beside each scene.
 
@@ -249,16 +249,3 @@ def _find_files(scenes: Sequence[Path], output: Path | None, cameras: Any, **nam
             raise UsageError(f"{scene}: expected scenes to join, found a result of gsmerge{remedy}")
     files, *more = (find_scene_files(path, cameras=cameras, **named) for path in scenes)
     return replace(files, more=tuple(more))
-
-
-def print_estimate(
-    files: "SceneFiles", settings: CompactOptions, outputs: "Outputs", reading: opt.Reading, *, as_json: bool
-) -> None:
-    """Print an estimate of the result that ``compact`` would make."""
-    from gsmerge.jobs.estimate import dry_run_lines, estimate_files
-    from gsmerge.reading.input import read_input
-
-    load = read_input(files, opacity=reading.opacity, hints=reading.hints)
-    with opt.usage_errors():
-        document = estimate_files(load, settings, outputs)
-    print_document(document, dry_run_lines(document), as_json=as_json)

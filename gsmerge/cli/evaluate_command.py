@@ -3,10 +3,10 @@
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from gsmerge.cli import parameters as opt
-from gsmerge.cli.before_after import BeforeAfter, lpips_networks, read_before_after
+from gsmerge.cli.before_after import lpips_networks, read_before_after
 from gsmerge.cli.console import print_document, say_notes, stage_progress, terminal_columns
 from gsmerge.cli.paths import check_outputs, input_files, write_texts
 from gsmerge.errors import UsageError
@@ -54,6 +54,7 @@ def evaluate(
             raise UsageError(f"{path}: expected a name ending in {opt.join_words(SUFFIXES)}; gsmerge view makes pages")
     check_outputs(outputs, (*input_files(files), *after, targets, target_images), overwrite=overwrite)
     from gsmerge.runtime.documents import to_json
+    from gsmerge.scoring.evaluate import INPUT
     from gsmerge.scoring.evaluate import evaluate as evaluate_scene
     from gsmerge.scoring.evaluation_report import evaluation_csv, evaluation_document, evaluation_lines
 
@@ -72,20 +73,14 @@ def evaluate(
         evaluation = evaluate_scene(
             pair.scene, pair.gaussians, pair.held_out, options, cameras=pair.cameras, progress=on_step
         )
-    document = evaluation_document(evaluation, _describe_files(pair), notes)
+    infos = {INPUT: pair.load.info, **{name: ply.info for name, ply in pair.plys.items()}}
+    files_by_name = {
+        name: {"path": info.path, "bytes": info.file_bytes, "bytes_by_attribute": info.bytes_by_attribute}
+        for name, info in infos.items()
+    }
+    document = evaluation_document(evaluation, files_by_name, notes)
     writers = {".json": to_json, ".csv": evaluation_csv}
     write_texts({path: writers[path.suffix](document) for path in outputs})
     lines = evaluation_lines(document, terminal_columns(sys.stdout))
     print_document(document, lines, as_json=json, quiet=quiet, wrap=False)
     say_notes(evaluation.notes, quiet=silent)
-
-
-def _describe_files(pair: BeforeAfter) -> dict[str, dict[str, Any]]:
-    """Return path and bytes of the scene and of each compact version, by name."""
-    from gsmerge.scoring.evaluate import INPUT
-
-    infos = {INPUT: pair.load.info, **{name: ply.info for name, ply in pair.plys.items()}}
-    return {
-        name: {"path": info.path, "bytes": info.file_bytes, "bytes_by_attribute": info.bytes_by_attribute}
-        for name, info in infos.items()
-    }

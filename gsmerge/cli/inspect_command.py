@@ -1,6 +1,5 @@
 """``gsmerge inspect``: check and describe files, and say what compact would make of a scene."""
 
-from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
@@ -19,49 +18,32 @@ def inspect(
 ) -> None:  # fmt: skip
     """Check and describe files, and say what compact would make of each scene, or why compact refuses the scene."""
     from gsmerge.io.formats.table import INDEX
-    from gsmerge.jobs.file_checks import holds_scene
+    from gsmerge.jobs.file_checks import FileCheck, check_content, holds_scene
+    from gsmerge.runtime.documents import document_head, note_entries
 
-    path, reading = paths[0], opt.read_hints(hint)
-    if len(paths) == 1 and (holds_scene(path) or path.name == INDEX):
-        _inspect_scene(path, cameras, images, reading, json=json, quiet=quiet)
+    path, reading, silent = paths[0], opt.read_hints(hint), quiet or json
+    if len(paths) == 1 and (holds_scene(path) or path.name == INDEX):  # describe a scene in detail
+        from gsmerge.jobs.inspect import inspect as inspect_scene
+        from gsmerge.jobs.inspect import inspection_lines
+        from gsmerge.runtime.record import record_run
+
+        with stage_progress(quiet=silent) as on_step, record_run(on_step):
+            facts = inspect_scene(path, cameras=cameras, images=images, opacity=reading.opacity, **vars(reading.hints))
+            problems = check_content(path).problems if path.name == INDEX else ()
+        described = {**document_head(), **facts, "problems": list(problems)}
+        print_document(described, inspection_lines(facts), as_json=json, quiet=quiet)
+        if facts["compact"] is None:
+            problem_path, _, problem = facts["alignment_problem"].partition(": ")
+            raise SceneError(problem_path, problem)
+        if problems:
+            raise SceneError(path, "; ".join(problems))
         return
     if cameras is not None or images is not None:
         raise UsageError("--cameras and --images: expected one scene with them")
-    _print_checks(paths, reading, json=json, quiet=quiet)
-
-
-def _inspect_scene(
-    path: Path, cameras: str | None, images: str | None, reading: opt.Reading, *, json: bool, quiet: bool
-) -> None:
-    """Describe a scene in detail; SceneError if ``compact`` refuses the scene."""
-    from gsmerge.io.formats.table import INDEX
-    from gsmerge.jobs.file_checks import check_content
-    from gsmerge.jobs.inspect import inspect as inspect_scene
-    from gsmerge.jobs.inspect import inspection_lines
-    from gsmerge.runtime.documents import document_head
-    from gsmerge.runtime.record import record_run
-
-    with stage_progress(quiet=quiet or json) as progress, record_run(progress):
-        facts = inspect_scene(path, cameras=cameras, images=images, opacity=reading.opacity, **vars(reading.hints))
-        problems = check_content(path).problems if path.name == INDEX else ()
-    document, lines = {**document_head(), **facts, "problems": list(problems)}, inspection_lines(facts)
-    print_document(document, lines, as_json=json, quiet=quiet)
-    if facts["compact"] is None:
-        problem_path, _, problem = facts["alignment_problem"].partition(": ")
-        raise SceneError(problem_path, problem)
-    if problems:
-        raise SceneError(path, "; ".join(problems))
-
-
-def _print_checks(paths: Sequence[Path], reading: opt.Reading, *, json: bool, quiet: bool) -> None:
-    """Print a line for each file; SceneError if ``compact`` refuses one."""
-    from gsmerge.jobs.file_checks import FileCheck, check_content
-    from gsmerge.runtime.documents import document_head, note_entries
-
-    checks, silent = list[FileCheck](), quiet or json
-    with stage_progress(quiet=silent) as progress:
+    checks = list[FileCheck]()
+    with stage_progress(quiet=silent) as on_step:
         for path in paths:
-            progress(f"inspect: {path.name}", len(checks), len(paths))
+            on_step(f"inspect: {path.name}", len(checks), len(paths))
             checks.append(check_content(path, opacity=reading.opacity, hints=reading.hints))
     wrong, several = [check for check in checks if check.problems], len(checks) > 1
     notes = [note for check in checks for note in name_notes(check.path, check.notes)]

@@ -11,7 +11,7 @@ import os
 import re
 import shutil
 import textwrap
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -212,23 +212,18 @@ def settings_option(kinds: Sequence[Kind], example: str = "match=aabb") -> Any:
     def show(value: Any) -> Any:
         if LIST_SETTINGS not in (value or ()):
             return value or []
-        print("\n".join(_settings_lines(listed_settings(kinds))))
+        width, lines = max(40, shutil.get_terminal_size().columns), list[str]()
+        for name, declared in listed_settings(kinds).items():
+            default = declared.default
+            shown = default if isinstance(default, str) else json.dumps(default, default=str)
+            lines += [f"{name}={shown}", *textwrap.wrap(declared.help, width, initial_indent="    ",
+                      subsequent_indent="    ")]  # fmt: skip
+        print("\n".join(lines))
         raise typer.Exit
 
     show.kinds = kinds  # type: ignore[attr-defined]  # for suggestions
     help = f"Any other setting, such as {example}; may be repeated. --set help lists all."
     return option(METHOD, "NAME=VALUE", help, read=show, is_eager=True)
-
-
-def _settings_lines(settings: Mapping[str, Setting]) -> list[str]:
-    """Format each setting with its default and help, for a terminal."""
-    width, lines = max(40, shutil.get_terminal_size().columns), list[str]()
-    for name, declared in settings.items():
-        default = declared.default
-        shown = default if isinstance(default, str) else json.dumps(default, default=str)
-        lines += [f"{name}={shown}", *textwrap.wrap(declared.help, width, initial_indent="    ",
-                  subsequent_indent="    ")]  # fmt: skip
-    return lines
 
 
 def _plain(help: str) -> str:

@@ -31,7 +31,10 @@ def check_outputs(
     ``reports``: the outputs are reports. Reports replace reports of gsmerge, and no other files, whatever ``overwrite``
     is. Raises SceneError if an output cannot be written. Missing folders are not made here.
     """
+    from gsmerge.io.atomic import describe_existing
     from gsmerge.io.cameras.read_cameras import find_cameras
+    from gsmerge.io.first_bytes import may_be_replaced
+    from gsmerge.io.image_names import IMAGE_SUFFIXES
 
     paths = [path for path in inputs if path is not None]
     camera_files = [cameras for path in paths if path.is_dir() and (cameras := find_cameras(path)) is not None]
@@ -39,41 +42,32 @@ def check_outputs(
     for output in outputs:
         if output is None:
             continue
-        _check_output(output, input_paths, overwrite=overwrite, reports=reports)
-        if os.path.realpath(output) in seen:
+        try:
+            os.lstat(output)
+        except FileNotFoundError:
+            pass
+        except (OSError, ValueError) as error:  # ValueError: the name has a zero byte
+            reason = getattr(error, "strerror", None) or error
+            raise SceneError(output, f"cannot be written ({reason})", "choose another name") from error
+        if output.exists() and not output.is_file():
+            raise UsageError(
+                f"{output}: expected a file to write, found"
+                f" {'a folder; name a file in it' if output.is_dir() else 'a pipe or a device; name a file'}"
+            )
+        target = Path(os.path.realpath(output))
+        is_image = target.suffix.lower() in IMAGE_SUFFIXES and target.exists()
+        if str(target) in input_paths or (is_image and str(target.parent) in input_paths):
+            raise UsageError(f"{output}: expected an output other than the input; name another output")
+        if os.path.lexists(output) and not (overwrite or (reports and may_be_replaced(output))):
+            problem = f"{output}: {describe_existing(output)}"
+            raise UsageError(
+                f"{problem} and is not a report of gsmerge; name another output" if reports
+                else f"{problem}; pass --overwrite to replace it, or name another output"
+            )  # fmt: skip
+        _check_writable(output.parent, output, "a folder to write to")
+        if str(target) in seen:
             raise UsageError(f"{output}: expected a different file for each output, got it twice")
-        seen.add(os.path.realpath(output))
-
-
-def _check_output(output: Path, inputs: set[str], *, overwrite: bool, reports: bool) -> None:
-    """Check one output as :func:`check_outputs` does; ``inputs`` are paths without symbolic links."""
-    from gsmerge.io.atomic import describe_existing
-    from gsmerge.io.first_bytes import may_be_replaced
-    from gsmerge.io.image_names import IMAGE_SUFFIXES
-
-    try:
-        os.lstat(output)
-    except FileNotFoundError:
-        pass
-    except (OSError, ValueError) as error:  # ValueError: the name has a zero byte
-        reason = getattr(error, "strerror", None) or error
-        raise SceneError(output, f"cannot be written ({reason})", "choose another name") from error
-    if output.exists() and not output.is_file():
-        raise UsageError(
-            f"{output}: expected a file to write, found"
-            f" {'a folder; name a file in it' if output.is_dir() else 'a pipe or a device; name a file'}"
-        )
-    target = Path(os.path.realpath(output))
-    is_image = target.suffix.lower() in IMAGE_SUFFIXES and target.exists()
-    if str(target) in inputs or (is_image and str(target.parent) in inputs):
-        raise UsageError(f"{output}: expected an output other than the input; name another output")
-    if os.path.lexists(output) and not (overwrite or (reports and may_be_replaced(output))):
-        problem = f"{output}: {describe_existing(output)}"
-        raise UsageError(
-            f"{problem} and is not a report of gsmerge; name another output" if reports
-            else f"{problem}; pass --overwrite to replace it, or name another output"
-        )  # fmt: skip
-    _check_writable(output.parent, output, "a folder to write to")
+        seen.add(str(target))
 
 
 def _check_writable(folder: Path, output: Path, expected: str) -> None:

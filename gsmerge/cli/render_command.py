@@ -113,23 +113,18 @@ def _choose_kind(output: Path, scenes: Sequence[Path], path: str | None, frames:
             raise UsageError(f"{output}: expected a clip, {opt.join_words(CLIPS)}, or a folder with --path")
         if isinstance(views, str):
             raise UsageError("--views: expected a number of views for a clip or a --path, got a name")
-        _check_path(path or "orbit", frames)
+        if path is None:
+            return "path"
+        from gsmerge.drawing.camera_path import parse_camera_path
+
+        with opt.usage_errors():
+            is_file = parse_camera_path(path) is None
+        if is_file and not Path(path).exists():
+            raise UsageError(f"--path {path}: expected orbit, spline or a file of cameras, found no such file")
+        if is_file and frames is not None:
+            raise UsageError("--frames: expected orbit or spline; with a file of cameras, use --views")
         return "path"
     if frames is not None:
         raise UsageError(f"--frames: expected a clip, {opt.join_words(CLIPS)}, or a --path with it")
     is_single = isinstance(views, str) and len(scenes) == 1
     return "panel" if is_picture and not is_single else "views"
-
-
-def _check_path(path: str, frames: Any) -> None:
-    """Raise UsageError for an unknown path, or for ``--frames`` with a path that is a file."""
-    from gsmerge.drawing.camera_path import parse_camera_path
-
-    with opt.usage_errors():
-        if parse_camera_path(path) is not None:
-            return
-    if not Path(path).exists():
-        expected = "orbit, spline or a file of cameras"
-        raise UsageError(f"--path {path}: expected {expected}, found no such file")
-    if frames is not None:
-        raise UsageError("--frames: expected orbit or spline; with a file of cameras, use --views")

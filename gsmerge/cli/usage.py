@@ -58,33 +58,32 @@ class Command(TyperCommand):
     """A command that refuses half typed options, and whose usage line names the arguments as its help does."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the words after the name of the command; UsageError for an option without a value or with several."""
-        params = self.get_params(ctx)
+        """Parse the words after the name of the command.
+
+        UsageError for an option with one dash, a repeated option, or an option without a value.
+        """
+        params: list[Any] = self.get_params(ctx)
         adapt_to_texts(params)
+        flags = {flag for param in params for flag in param.opts}
         try:
-            self._check_words(ctx, params, args)
+            for typed in args[: args.index("--") if "--" in args else None]:
+                if re.match("-[^-]", typed) and f"-{typed.partition('=')[0]}" in flags:
+                    raise UsageError(f"{typed}: expected two dashes, -{typed}")
+            values, _, order = self.make_parser(ctx).parse_args(list(args))
+            for param in params:
+                is_option = param.param_type_name == "option"
+                label = param.opts[0] if is_option else str(param.metavar).strip("[].")
+                if is_option and order.count(param) > 1 and not (param.multiple or param.is_flag):
+                    raise UsageError(f"{label}: expected it once, got it again")
+                value = values.get(param.name)
+                for word in value if isinstance(value, list | tuple) else (value,):
+                    is_flag = is_option and isinstance(word, str) and (word == "-" or word[:2] == "--" or word in flags)
+                    if word == "" or is_flag:  # a flag in place of a value
+                        raise UsageError(f"{label}: expected a value, got {word or 'an empty one'}")
             return super().parse_args(ctx, args)
         except UsageErrors as error:
             error.ctx = error.ctx or ctx  # errors of the parser have no context
             raise
-
-    def _check_words(self, ctx: Any, params: list[Any], args: list[str]) -> None:
-        """Raise UsageError for an option with one dash, a repeated option, or a flag in place of a value."""
-        flags = {flag for param in params for flag in param.opts}
-        for typed in args[: args.index("--") if "--" in args else None]:
-            if re.match("-[^-]", typed) and f"-{typed.partition('=')[0]}" in flags:
-                raise UsageError(f"{typed}: expected two dashes, -{typed}")
-        values, _, order = self.make_parser(ctx).parse_args(list(args))
-        for param in params:
-            is_option = param.param_type_name == "option"
-            label = param.opts[0] if is_option else str(param.metavar).strip("[].")
-            if is_option and order.count(param) > 1 and not (param.multiple or param.is_flag):
-                raise UsageError(f"{label}: expected it once, got it again")
-            value = values.get(param.name)
-            for word in value if isinstance(value, list | tuple) else (value,):
-                is_flag = is_option and isinstance(word, str) and (word == "-" or word[:2] == "--" or word in flags)
-                if word == "" or is_flag:
-                    raise UsageError(f"{label}: expected a value, got {word or 'an empty one'}")
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
         """List the parts of the usage line after the name of the command."""

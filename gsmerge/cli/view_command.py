@@ -80,17 +80,11 @@ def show_page(
         "headline": summary,
     }
     print_document(document, f"{output}: {summary}", as_json=json, quiet=quiet)
-    if open and not _open(output):
-        say(f"open {output.absolute().as_uri()} in a browser", quiet=silent)
+    if open:
+        import webbrowser
 
-
-def _open(page: Path) -> bool:
-    """Open a page in the browser, and return whether that worked.
-
-    Nothing is opened without a screen, because a text browser would take over the terminal.
-    """
-    if sys.platform.startswith("linux") and not {"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ):
-        return False
-    import webbrowser
-
-    return webbrowser.open(page.absolute().as_uri())
+        # Nothing is opened without a screen, because a text browser would take over the terminal
+        has_screen = not sys.platform.startswith("linux") or {"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ)
+        address = output.absolute().as_uri()
+        if not (has_screen and webbrowser.open(address)):
+            say(f"open {address} in a browser", quiet=silent)

@@ -162,12 +162,6 @@ class _Split:
     covered: NDArray[np.bool_] | None  # [v,h,w] pixels that the input covers; None: where the input is opaque
     reference: str  # words for the pictures with which results are compared, such as "photos"
     scored: Sequence[int]  # ids of the views that are scored
-    drawn: Gaussians | None = None  # the input, if its renders replace photos; otherwise None
-
-    def move_to(self, cameras: Cameras | None) -> _Split:
-        """Return the split with the cameras of a result. Renders of the input keep the cameras that drew them."""
-        view_cameras = self.views.cameras if cameras is None or self.drawn is not None else cameras
-        return replace(self, views=replace(self.views, cameras=view_cameras))
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,8 +218,12 @@ def evaluate(
         >>> evaluation.num_views
         {'context': 5}
     """
-    cameras = cameras or {}
-    options, lpips_notes = _without_missing(EvaluateOptions()) if options is None else (options, ())
+    lpips_notes: Sequence[str] = ()
+    if options is None:
+        from gsmerge.scoring.lpips import installed_networks
+
+        nets, lpips_notes = installed_networks(EvaluateOptions().lpips)
+        options = EvaluateOptions(lpips=nets)
     if INPUT in results:
         raise UsageError(f"results: expected names other than {INPUT!r}")
     if len(scene) == 0:
@@ -238,12 +236,11 @@ def evaluate(
     if targets is not None:
         targets = replace(targets, cameras=targets.cameras.numpy(), images=as_pictures(targets.images))
         targets = shrink_views(targets, options.photo_side)
-    cameras = {name: shrink_cameras(moved.numpy(), options.photo_side) for name, moved in cameras.items()}
+    cameras = {name: shrink_cameras(moved.numpy(), options.photo_side) for name, moved in (cameras or {}).items()}
     with use_threads(options.threads):
         renderer = _Renderer(near_plane(scene), options)
         progress("what the input views see", 0, 0)
-        reference = PHOTOS if scene is original else ROW_COLORS
-        splits = _make_splits(scene, reference, inputs, targets, renderer)
+        splits = _make_splits(scene, PHOTOS if scene is original else ROW_COLORS, inputs, targets, renderer)
         scored = {INPUT: inputs, **outputs} if options.own else outputs
         has_fog = options.fog and bool(outputs)
         fog = measure_fog(scene.gaussians.numpy(), outputs, scene.cameras, renderer.near, progress) if has_fog else {}
@@ -259,34 +256,18 @@ def evaluate(
             _score_split(kind, split, scored, cameras if kind == "context" else {}, renderer, report_image)
             for kind, split in splits.items()
         ]
-    scores = [
-        ResultScores(
-            name,
-            len(gaussians),
-            len(gaussians) / max(len(inputs), 1),
-            *_list_scores(name, split_scores),
-            fog.get(name, {}),
-        )
-        for name, gaussians in scored.items()
-    ]
+    scores = []
+    for name, gaussians in scored.items():
+        timed_views = [view for views_by_name in split_scores for view in views_by_name[name]]
+        seconds = float(np.median([seconds for seconds, _ in timed_views]))
+        views, ratio = tuple(view for _, view in timed_views), len(gaussians) / max(len(inputs), 1)
+        scores.append(ResultScores(name, len(gaussians), ratio, seconds, views, fog.get(name, {})))
+    # Words for the pictures with which results are compared, in held-out views first
+    references = list(dict.fromkeys(splits[kind].reference for kind in ("target", "context") if kind in splits))
+    words = f"{references[0]}, and {references[1]} in its own views" if len(references) > 1 else references[0]
     counts = {name: len(split.scored) for name, split in splits.items()}
     notes = (*lpips_notes, *_describe_scores(splits, scores, mended=mended))
-    return Evaluation(tuple(scores), _name_reference(splits), counts, notes, options, scene.images)
-
-
-def _without_missing(options: EvaluateOptions) -> tuple[EvaluateOptions, tuple[str, ...]]:
-    """Return the options without LPIPS networks that are not installed, and a note if none is installed."""
-    from gsmerge.scoring.lpips import INSTALL, lpips_available
-
-    nets = tuple(net for net in options.lpips if lpips_available(net))
-    note = f"LPIPS is left out, since its weights are not installed: {INSTALL}"
-    return replace(options, lpips=nets), () if nets else (note,)
-
-
-def _name_reference(splits: Mapping[str, _Split]) -> str:
-    """Return words for the pictures with which results are compared, in held-out views first."""
-    names = list(dict.fromkeys(splits[kind].reference for kind in ("target", "context") if kind in splits))
-    return f"{names[0]}, and {names[1]} in its own views" if len(names) > 1 else names[0]
+    return Evaluation(tuple(scores), words, counts, notes, options, scene.images)
 
 
 def near_plane(scene: Scene) -> float:
@@ -345,7 +326,7 @@ def _make_splits(
         context = make_split(views, reference, scene.masks)
     else:
         drawn = np.stack([renderer.image(inputs, cameras, i) for i in range(len(scene))])
-        context = replace(make_split(Views(cameras, drawn, scene.names), RENDERS, scene.masks), drawn=inputs)
+        context = make_split(Views(cameras, drawn, scene.names), RENDERS, scene.masks)
     if scene.covered is not None:
         covered = np.stack([resize_mask(mask, cameras.width, cameras.height) for mask in scene.covered])
         context = replace(context, covered=covered)
@@ -368,14 +349,15 @@ def _score_split(
     """
     options, names = renderer.options, split.views.names
     lpips_views = pick_views(len(names), options.lpips_views or len(names))
-    moved = {name: split.move_to(cameras.get(name)) for name in results}
+    # Renders of the input keep the cameras that drew them
+    moved = {} if split.reference == RENDERS else cameras
     scores: dict[str, list[tuple[float, ViewScore]]] = {name: [] for name in results}
     for view in range(len(names)):
         covered = None if split.covered is None else split.covered[view]
         nets = options.lpips if view in lpips_views else ()
         for name, gaussians in results.items():
             start = time.perf_counter()
-            image, is_opaque = renderer.draw(gaussians, moved[name].views.cameras, view)
+            image, is_opaque = renderer.draw(gaussians, moved.get(name, split.views.cameras), view)
             seconds = time.perf_counter() - start
             on_image(name, kind, view, image)
             if name == INPUT and covered is None:
@@ -399,50 +381,24 @@ def _add_qualities(
     photo, seen = split.views.images[view], split.visible[view]
     share = None if covered is None else float(covered.mean())
     covered_mask = covered if share is not None and share < WHOLE_SHARE else None
-    full, masked, covered_quality = _measure_qualities(image, photo, (None, seen, covered_mask))  # None: all pixels
-    full, masked = _add_lpips((full, masked), image, photo, seen, nets)
-    score = replace(score, full=full, masked=masked)
-    return score if share is None else replace(score, covered_share=share, covered=covered_quality)
-
-
-def _list_scores(
-    name: str, split_scores: Sequence[Mapping[str, Sequence[tuple[float, ViewScore]]]]
-) -> tuple[float, tuple[ViewScore, ...]]:
-    """Join what :func:`_score_split` returns for one result: the median seconds of drawing, and all its scores."""
-    all_views = [view for scores in split_scores for view in scores[name]]
-    return float(np.median([seconds for seconds, _ in all_views])), tuple(score for _, score in all_views)
-
-
-def _measure_qualities(
-    image: np.ndarray, photo: np.ndarray, masks: Sequence[NDArray[np.bool_] | None]
-) -> list[Quality]:
-    """Measure PSNR and SSIM of an image over the pixels in each mask. None stands for all pixels.
-
-    An empty mask gives no measures.
-    """
-    masks = [None if mask is None or mask.all() else mask for mask in masks]
+    # PSNR and SSIM over the pixels in each mask. None stands for all pixels, and an empty mask gives no measures
+    masks = [None if mask is None or mask.all() else mask for mask in (None, seen, covered_mask)]
     filled = [mask for mask in masks if mask is None or mask.any()]
     measures = iter(zip(psnr_within(image, photo, filled), ssim_within(image, photo, filled), strict=True))
-    return [Quality(*next(measures)) if mask is None or mask.any() else Quality() for mask in masks]
+    full, masked, covered_quality = (
+        Quality(*next(measures)) if mask is None or mask.any() else Quality() for mask in masks
+    )
+    if nets:
+        from gsmerge.scoring.lpips import lpips, min_size
 
-
-def _add_lpips(
-    pair: QualityPair, image: np.ndarray, photo: np.ndarray, seen: NDArray[np.bool_], nets: Sequence[str]
-) -> QualityPair:
-    """Add LPIPS to the qualities over all pixels, and over the pixels that the input views have seen."""
-    if not nets:
-        return pair
-    from gsmerge.scoring.lpips import lpips, min_size
-
-    fitting = [net for net in nets if min(image.shape[:2]) >= min_size(net)]
-
-    def add(quality: Quality, mask: NDArray[np.bool_] | None) -> Quality:
-        """Add the LPIPS of all networks within a mask; None: all pixels."""
-        return replace(quality, **{f"lpips_{net}": lpips(image, photo, net, mask) for net in fitting})
-
-    full = add(pair[0], None)
-    # Without seen pixels there is no LPIPS over them
-    return full, full if seen.all() else add(pair[1], seen) if seen.any() else pair[1]
+        fitting = [net for net in nets if min(image.shape[:2]) >= min_size(net)]
+        full = replace(full, **{f"lpips_{net}": lpips(image, photo, net, None) for net in fitting})
+        if seen.all():
+            masked = full
+        elif seen.any():  # without seen pixels there is no LPIPS over them
+            masked = replace(masked, **{f"lpips_{net}": lpips(image, photo, net, seen) for net in fitting})
+    score = replace(score, full=full, masked=masked)
+    return score if share is None else replace(score, covered_share=share, covered=covered_quality)
 
 
 def _average(scores: Sequence[Quality]) -> Quality:

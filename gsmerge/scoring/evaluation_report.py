@@ -44,22 +44,18 @@ def evaluation_document(
     ``photo_side`` is present unless 0, ``antialiased`` is present if true, and ``lpips_views`` if some split has views
     without LPIPS. Within a schema version keys may be added, but not removed.
     """
+    num_views = evaluation.options.lpips_views
+    some_lpips = evaluation.options.lpips and num_views and num_views < max(evaluation.num_views.values())
     return {
         **document_head(),
         "reference": evaluation.reference,
         **({"photo_side": evaluation.options.photo_side} if evaluation.options.photo_side else {}),
         **({"antialiased": True} if evaluation.options.antialiased else {}),
-        **({"lpips_views": evaluation.options.lpips_views} if _some_lpips(evaluation) else {}),
+        **({"lpips_views": num_views} if some_lpips else {}),
         "num_views": dict(evaluation.num_views),
         "results": [_result_entries(result, evaluation, facts.get(result.name, {})) for result in evaluation.results],
         **note_entries([*notes, *evaluation.notes]),
     }
-
-
-def _some_lpips(evaluation: Evaluation) -> bool:
-    """Return whether LPIPS was measured, but only on some of the views."""
-    num_views = evaluation.options.lpips_views
-    return bool(evaluation.options.lpips and num_views and num_views < max(evaluation.num_views.values()))
 
 
 def _result_entries(result: ResultScores, evaluation: Evaluation, facts: Mapping[str, Any]) -> dict[str, Any]:
@@ -112,12 +108,21 @@ def evaluation_csv(document: Mapping[str, Any]) -> str:
 
 def evaluation_tables(document: Mapping[str, Any]) -> Iterator[TextTable]:
     """Yield the text tables of an evaluation, each as a heading, columns and rows."""
-    results = document["results"]
-    yield (
-        "Size",
-        ("", "Gaussians", "kept", "file", "smaller by", "bytes each", "ms/view"),
-        [_size_row(result, results[0]) for result in results],
-    )
+    results, sizes = document["results"], []
+    input_size = results[0].get("bytes")
+    for result in results:
+        size, bytes_by_attribute = result.get("bytes"), result.get("bytes_by_attribute", {})
+        bytes_each = sum(bytes_by_attribute.values()) / max(result["num_gaussians"], 1)
+        sizes.append((
+            result["name"],
+            f"{result['num_gaussians']:,}",
+            human_share(result["ratio"]),
+            "" if size is None else human_bytes(size),
+            "" if result is results[0] or not (size and input_size) else f"{input_size / size:.1f} x",
+            f"{bytes_each:.1f}" if bytes_each else "",
+            f"{1000 * result['render_seconds']:.1f}",
+        ))  # fmt: skip
+    yield "Size", ("", "Gaussians", "kept", "file", "smaller by", "bytes each", "ms/view"), sizes
     for split in document["num_views"]:
         yield from _quality_tables(document, split)
     outside = [(result["name"], *(_format_score(result[name]) for name in OUTSIDE_COLUMNS)) for result in results]
@@ -135,9 +140,11 @@ def _quality_tables(document: Mapping[str, Any], split: str) -> Iterator[TextTab
     quality = "Quality" if "target" in document["num_views"] else "No view was held out: quality"
     views = f"{quality} of {count} {SPLIT_WORDS[split]} view{'s' * (count > 1)}"
     means = [(result["name"], result["mean"][split]) for result in results]
-    seen = (
-        f"against {document['reference']}, over the pixels that the input views have seen{_describe_options(document)}"
-    )
+    # The heading ends with the options that change scores
+    seen = f"against {document['reference']}, over the pixels that the input views have seen"
+    seen += ", rendered antialiased" if document.get("antialiased") else ""
+    seen += f", of photos with at most {document['photo_side']} pixels per side" if "photo_side" in document else ""
+    seen += f", LPIPS on {document['lpips_views']} views" if "lpips_views" in document else ""
     yield f"{views}, {seen}", ("", *SCORE_COLUMNS.values()), [(name, *_format_figures(mean)) for name, mean in means]
     input_mean = next(iter(results[0]["mean"].values()))  # over the input views, if they are measured
     lacks_pixels = (input_mean["share" + COVERED_SUFFIX] or 1) < WHOLE_SHARE
@@ -146,28 +153,6 @@ def _quality_tables(document: Mapping[str, Any], split: str) -> Iterator[TextTab
         (name, f"{100 * mean['share' + COVERED_SUFFIX]:.0f} %", *_format_figures(mean, SIMPLE, COVERED_SUFFIX))
         for name, mean in (means if lacks_pixels else [])
     ]  # fmt: skip
-
-
-def _describe_options(document: Mapping[str, Any]) -> str:
-    """Describe the options that change scores, for the end of a heading; "" for the defaults."""
-    words = ", rendered antialiased" if document.get("antialiased") else ""
-    words += f", of photos with at most {document['photo_side']} pixels per side" if "photo_side" in document else ""
-    return words + (f", LPIPS on {document['lpips_views']} views" if "lpips_views" in document else "")
-
-
-def _size_row(result: Mapping[str, Any], first: Mapping[str, Any]) -> Row:
-    """Return the row of a result in the table of sizes, which compares the result's size with the size of ``first``."""
-    size, input_size = result.get("bytes"), first.get("bytes")
-    bytes_each = sum(result.get("bytes_by_attribute", {}).values()) / max(result["num_gaussians"], 1)
-    return (
-        result["name"],
-        f"{result['num_gaussians']:,}",
-        human_share(result["ratio"]),
-        "" if size is None else human_bytes(size),
-        "" if result is first or not (size and input_size) else f"{input_size / size:.1f} x",
-        f"{bytes_each:.1f}" if bytes_each else "",
-        f"{1000 * result['render_seconds']:.1f}",
-    )
 
 
 def _format_figures(
@@ -183,18 +168,14 @@ def _format_score(value: float | None, digits: int = 3) -> str:
     return "" if value is None else f"{value:.{digits}f}"
 
 
-def filled_tables(document: Mapping[str, Any]) -> Iterator[TextTable]:
-    """Yield the tables of :func:`evaluation_tables` without empty columns, and without tables that have no rows."""
-    for heading, head, rows in evaluation_tables(document):
-        filled = [i for i in range(len(head)) if i == 0 or any(row[i] for row in rows)]
-        if rows:
-            yield heading, [head[i] for i in filled], [[row[i] for i in filled] for row in rows]
-
-
 def evaluation_lines(document: Mapping[str, Any], columns: int | None = None) -> list[str]:
     """Format the tables of an evaluation as lines for a terminal that is ``columns`` letters wide; None: unlimited."""
     lines = list[str]()
-    for heading, head, rows in filled_tables(document):
+    for heading, columns_of_table, all_rows in evaluation_tables(document):
+        if not all_rows:
+            continue
+        filled = [i for i in range(len(columns_of_table)) if i == 0 or any(row[i] for row in all_rows)]
+        head, rows = [columns_of_table[i] for i in filled], [[row[i] for i in filled] for row in all_rows]
         omitted_first = [head.index(name) for name in OMITTED_FIRST if name in head]
         lines += wrap_line(heading, columns, 2)
         lines += text_table([head, *rows], "  ", letters=columns, omitted_first=omitted_first)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 import pickle
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, reduce
 from importlib.util import find_spec
@@ -111,8 +111,22 @@ def lpips(image: Array, reference: Array, net: str = "vgg", mask: Array | None =
     layers = _load_layers(path, net)
     small = values.shape[0] * values.shape[1] <= MAX_CACHED_PIXELS
     compute = _cached_features if small else _cached_features.__wrapped__
-    features = compute(values.tobytes(), values.shape, path, net)
-    return _sum_differences(_normalise_features(first.astype(np.float32), layers), features, layers)
+    reference_units = compute(values.tobytes(), values.shape, path, net)
+    units = _normalise_features(first.astype(np.float32), layers)
+    compared = [layer.weights for layer in layers if layer.weights is not None]
+    # Squared differences of unit features are averaged over pixels, weighted by channel, and summed over channels and
+    # layers (equation 1 of Zhang et al.)
+    distance = 0.0
+    for weights, unit, reference_unit in zip(compared, units, reference_units, strict=True):
+        means = np.square(unit - reference_unit).mean((0, 1), dtype=np.float64)
+        distance += float((means * weights).sum())
+    return distance
+
+
+def installed_networks(nets: Sequence[str]) -> tuple[tuple[str, ...], list[str]]:
+    """Return those of the networks ``nets`` whose weights are installed, and a note if there are none."""
+    installed = tuple(net for net in nets if lpips_available(net))
+    return installed, [] if installed else [f"LPIPS is left out, since its weights are not installed: {INSTALL}"]
 
 
 def lpips_available(net: str = "vgg") -> bool:
@@ -150,21 +164,6 @@ def read_layers(net: str) -> tuple[Convolution, ...]:
     return _load_layers(require_lpips(net), net)
 
 
-def _sum_differences(
-    units: Iterable[np.ndarray], reference_units: Iterable[np.ndarray], layers: tuple[Convolution, ...]
-) -> float:
-    """Return the distance of two images from their unit features, layer by layer (equation 1 of Zhang et al.).
-
-    Squared differences are averaged over pixels, weighted by channel, and summed over channels and layers.
-    """
-    distance = 0.0
-    compared = [layer.weights for layer in layers if layer.weights is not None]
-    for weights, unit, reference_unit in zip(compared, units, reference_units, strict=True):
-        means = np.square(unit - reference_unit).mean((0, 1), dtype=np.float64)
-        distance += float((means * weights).sum())
-    return distance
-
-
 @lru_cache(maxsize=MAX_CACHED)  # successive calls often have the same reference, for one network or both
 def _cached_features(reference: bytes, shape: tuple[int, ...], path: Path, net: str) -> list[np.ndarray]:
     """Compute and cache the unit features of an image of a ``shape``, whose float32 values a cache takes as bytes."""
@@ -175,19 +174,15 @@ def _normalise_features(image: np.ndarray, layers: tuple[Convolution, ...]) -> I
     """Yield the features ``[h,w,c]`` of each compared layer of an image, scaled to unit length at every pixel."""
     features = (2 * image - 1 - INPUT_SHIFT) / INPUT_SCALE
     for layer in layers:
-        if layer.conv.pool:
-            features = _max_pool(features, layer.conv.pool)
+        if side := layer.conv.pool:
+            # The largest value in every second window of ``side`` x ``side`` pixels, down and across
+            height, width = (2 * ((n - side) // 2) + 1 for n in features.shape[:2])
+            corners = [(y, x) for y in range(side) for x in range(side)]
+            features = reduce(np.maximum, [features[y : y + height : 2, x : x + width : 2] for y, x in corners])
         features = _convolve(features, layer)
         if layer.weights is not None:
             lengths = np.sqrt(np.square(features).sum(-1, keepdims=True))
             yield features / (lengths + EPSILON)
-
-
-def _max_pool(picture: np.ndarray, size: int) -> np.ndarray:
-    """Return the largest value in every second window of ``size`` x ``size`` pixels, down and across."""
-    height, width = (2 * ((n - size) // 2) + 1 for n in picture.shape[:2])
-    corners = [(y, x) for y in range(size) for x in range(size)]
-    return reduce(np.maximum, [picture[y : y + height : 2, x : x + width : 2] for y, x in corners])
 
 
 def _convolve(picture: np.ndarray, layer: Convolution) -> np.ndarray:

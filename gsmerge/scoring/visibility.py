@@ -13,7 +13,7 @@ from gsmerge.kernels.matrices import invert, matmul
 from gsmerge.kernels.reproject import mark_pixels
 from gsmerge.raster import render
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.types import Cameras, Gaussians, Scene
+from gsmerge.types import Cameras, Scene
 
 Points = NDArray[np.float64]  # [n,3]
 VISIBILITY_GAUSSIANS = 200_000  # largest sample of Gaussians on which a share is measured
@@ -28,20 +28,18 @@ def context_points(scene: Scene, near: float, cameras: Cameras | None = None) ->
     """
     if scene.has_own_pixels:
         return scene.file_gaussians.means.astype(np.float64)
-    cameras = scene.cameras if cameras is None else cameras
-    return np.concatenate([_render_points(scene.gaussians, cameras[[i]], near) for i in range(len(cameras))])
-
-
-def _render_points(gaussians: Gaussians, camera: Cameras, near: float) -> Points:
-    """Render the depths of one camera, and return the points ``[n,3]`` at these depths; faint pixels give no point."""
-    drawn = render(gaussians, camera, near=near, with_depths=True)
-    assert drawn.depths is not None
-    depths = drawn.depths[0, ..., 0]
-    min_alpha = 0.5  # least alpha of a pixel whose rendered depth is that of a surface
-    y, x = np.nonzero(drawn.alphas[0, ..., 0] > min_alpha)
-    rays = matmul(np.stack([x + 0.5, y + 0.5, np.ones(len(x))], 1), invert(camera.Ks[0].astype(np.float64)).T)
-    pose = invert(camera.viewmats[0].astype(np.float64))
-    return matmul(rays * depths[y, x, None].astype(np.float64), pose[:3, :3].T) + pose[:3, 3]
+    cameras, points = scene.cameras if cameras is None else cameras, []
+    for view in range(len(cameras)):
+        camera = cameras[[view]]
+        drawn = render(scene.gaussians, camera, near=near, with_depths=True)
+        assert drawn.depths is not None
+        depths = drawn.depths[0, ..., 0]
+        min_alpha = 0.5  # least alpha of a pixel whose rendered depth is that of a surface
+        y, x = np.nonzero(drawn.alphas[0, ..., 0] > min_alpha)
+        rays = matmul(np.stack([x + 0.5, y + 0.5, np.ones(len(x))], 1), invert(camera.Ks[0].astype(np.float64)).T)
+        pose = invert(camera.viewmats[0].astype(np.float64))
+        points.append(matmul(rays * depths[y, x, None].astype(np.float64), pose[:3, :3].T) + pose[:3, 3])
+    return np.concatenate(points)
 
 
 def visible_pixels(points: Points, cameras: Cameras, near: float, sources: Cameras | None = None) -> NDArray[np.bool_]:
@@ -57,7 +55,13 @@ def visible_pixels(points: Points, cameras: Cameras, near: float, sources: Camer
         """Return the mask ``[h,w]`` of one view."""
         hit = np.zeros((cameras.height, cameras.width), np.uint8)
         seen = hit > 0
-        side = _choose_mark_side(Ks[view], sources)
+        side = 3  # least side of the square that a point marks, pixels
+        if sources is not None:
+            # The square covers the same angle as so many pixels of ``sources``, if this makes the square larger
+            focal, source_focals = (
+                np.sqrt(K[..., 0, 0] * K[..., 1, 1]) for K in (Ks[view], sources.Ks.astype(np.float64))
+            )
+            side = max(side, 2 * round((side * float(focal / median(source_focals)) - 1) / 2) + 1)
         first = len(points) * view // len(cameras)  # in most scenes the view's own points begin here
         for start in (*range(first, len(points), _CHUNK), *range(0, first, _CHUNK)):
             mark_pixels(points[start : start + _CHUNK], viewmats[view], Ks[view], near, hit)
@@ -67,18 +71,6 @@ def visible_pixels(points: Points, cameras: Cameras, near: float, sources: Camer
         return seen
 
     return np.stack(parallel_map(mark_view, range(len(cameras))))
-
-
-def _choose_mark_side(K: np.ndarray, sources: Cameras | None) -> int:
-    """Choose the side of the square that a point marks in a view with intrinsics ``K [3,3]``: an odd number of pixels.
-
-    The square covers the same angle as ``min_side`` pixels of ``sources``, if this makes the square larger.
-    """
-    min_side = 3  # least side of the square, pixels
-    if sources is None:
-        return min_side
-    focal, source_focals = (np.sqrt(Ks[..., 0, 0] * Ks[..., 1, 1]) for Ks in (K, sources.Ks.astype(np.float64)))
-    return max(min_side, 2 * round((min_side * float(focal / median(source_focals)) - 1) / 2) + 1)
 
 
 def inside_views(points: np.ndarray, cameras: Cameras) -> Iterator[np.ndarray]:
