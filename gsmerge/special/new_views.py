@@ -24,7 +24,7 @@ from gsmerge.runtime.record import begin_part, record_part
 from gsmerge.settings.budget import parse_share
 from gsmerge.settings.stages import SHARE
 from gsmerge.special.left_out import LEAST_SEEN, choose_left_out, leave_out, mean_seen
-from gsmerge.types import Cameras, PicturedScene, Pixels
+from gsmerge.types import PicturedScene, Pixels
 
 TRIAL_PIXELS = 120  # the longer side of the small pictures has at least this many pixels
 # Most steps of the fit. With fewer than 150 steps, fits of few views have other settings than longer fits
@@ -121,7 +121,9 @@ def _score_round(prepared: Prepared, views: Sequence[int], plan: Plan, share: fl
     that the other views see, and the PSNR (dB) of renders from all Gaussians, from the Gaussians of the other views,
     and from the result. Returns None if no other view sees what the left-out photos show.
     """
-    used_views = views_around(prepared.scene.cameras, views, TRIAL_VIEWS)
+    distances = camera_distances(prepared.scene.cameras)[list(views)].min(0)
+    distances[list(views)] = -1.0  # the left-out views come first, then the nearest others
+    used_views = sorted(np.argsort(distances, kind="stable")[:TRIAL_VIEWS].tolist())
     scene = prepared.scene if len(used_views) == len(prepared.scene) else subset(prepared.scene, used_views)
     small = shrink_scene(scene, max(1, max(scene.cameras.width, scene.cameras.height) // TRIAL_PIXELS))
     left_out = leave_out(small, [used_views.index(view) for view in views], prepared)
@@ -136,13 +138,6 @@ def _score_round(prepared: Prepared, views: Sequence[int], plan: Plan, share: fl
     compacted = build(left_out.rest, replace(trial_plan, fit=fit, is_trial=True), None).gaussians
     scored = small.file_gaussians, left_out.rows, compacted
     return np.stack([left_out.shares, *(left_out.score(gaussians) for gaussians in scored)])
-
-
-def views_around(cameras: Cameras, views: Sequence[int], most: int) -> list[int]:
-    """Return ``views`` and the views whose cameras are nearest to any of them, at most ``most`` together, ascending."""
-    distances = camera_distances(cameras)[list(views)].min(0)
-    distances[list(views)] = -1.0
-    return sorted(np.argsort(distances, kind="stable")[:most].tolist())
 
 
 def shrink_scene(scene: PicturedScene, step: int) -> PicturedScene:

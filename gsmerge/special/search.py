@@ -85,7 +85,13 @@ def _reach_target(prepared: Prepared, plan: Plan) -> Candidate:
     def measure(count: int) -> float:
         """Build a result with ``count`` Gaussians, and return the PSNR (dB) that decides about it."""
         if left_out is not None:
-            return score_left_out(left_out, tried_plan, count)
+            begin_part("build")
+            with record_part() as record:
+                fitted = build(left_out.rest, tried_plan, left_out.reduce(count))
+                with stage("score"):
+                    psnr = mean_seen(left_out.score(fitted.gaussians), left_out.shares)
+            add_seconds(record.seconds)
+            return psnr
         candidates[count] = candidate = build_candidate(prepared, tried_plan, count)
         add_seconds(candidate.record.seconds)
         return candidate.deciding_psnr or 0.0
@@ -146,13 +152,6 @@ class CountSearch:
 
     def run(self, measure: Callable[[int], float]) -> None:
         """Measure the PSNR (dB) of each count that the search chooses."""
-        count, most_builds = self.first, MAX_BUILDS if self.left_out is None else MAX_LEFT_OUT_BUILDS
-        while count not in self.psnrs and len(self.psnrs) < most_builds:
-            self.psnrs[count] = measure(count)
-            count = next_count(self.psnrs, self.target, *self._allowed_counts(), *self._slope_and_tolerance())
-
-    def _allowed_counts(self) -> tuple[int, int]:
-        """Return the fewest and the most Gaussians that a candidate may have, by the limits and the kind of search."""
         plan, limits = self.plan, self.plan.limits
         least, most = limits.min_count, limits.max_count
         if plan.keeps_fidelity and not plan.auto_count:
@@ -162,18 +161,20 @@ class CountSearch:
             most = min(most, max_factor * limits.default)
         if self.left_out is not None and self.most:
             most = min(most, self.most)
-        return least, most
-
-    def _slope_and_tolerance(self) -> tuple[float, float]:
-        """Return the slope to assume at first (dB per doubling of the count), and the tolerance of the search (dB).
-
-        The search ends at a PSNR that is at most the tolerance above the target.
-        """
+        # The slope (dB per doubling of the count) is assumed at first. The search ends at a PSNR that is at most
+        # ``near`` dB above the target
+        slope, near = PHOTOS_SLOPE, PHOTOS_NEAR_DB if plan.keeps_fidelity else 0.0
         if self.left_out is not None:
-            return 0.3, 0.15  # the mean slope of eleven captures below the usual count; half of it is near enough
-        if self.rendered:
-            return RENDERS_SLOPE, NEAR_DB
-        return PHOTOS_SLOPE, PHOTOS_NEAR_DB if self.plan.keeps_fidelity else 0.0
+            slope, near = (
+                0.3,
+                0.15,
+            )  # the mean slope of eleven captures below the usual count; half of it is near enough
+        elif self.rendered:
+            slope, near = RENDERS_SLOPE, NEAR_DB
+        count, most_builds = self.first, MAX_BUILDS if self.left_out is None else MAX_LEFT_OUT_BUILDS
+        while count not in self.psnrs and len(self.psnrs) < most_builds:
+            self.psnrs[count] = measure(count)
+            count = next_count(self.psnrs, self.target, least, most, slope, near)
 
     @property
     def best(self) -> int:
@@ -281,21 +282,6 @@ def leave_out_for_scores(prepared: Prepared, plan: Plan) -> LeftOut | None:
         pictures = "photos that the fit has seen" if has_target else "patches of photos that the fits have not seen"
         note(f"quality: measured on {pictures}, because {reason}; new views look worse")
     return None
-
-
-def score_left_out(left_out: LeftOut, plan: Plan, count: int) -> float:
-    """Build from the remaining views, by a ``plan`` for these views, and return the PSNR (dB) of the left-out photos.
-
-    ``count`` is the number of Gaussians for all views. The remaining views get a part of it, in proportion to their
-    number.
-    """
-    begin_part("build")
-    with record_part() as record:
-        fitted = build(left_out.rest, plan, left_out.reduce(count))
-        with stage("score"):
-            psnr = mean_seen(left_out.score(fitted.gaussians), left_out.shares)
-    add_seconds(record.seconds)
-    return psnr
 
 
 def choose_count(prepared: Prepared, plan: Plan) -> int | None:

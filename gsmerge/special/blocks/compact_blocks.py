@@ -9,15 +9,19 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from gsmerge.errors import Doubt
 from gsmerge.fit import fit_scene, peak_weights
 from gsmerge.geometry.frame import Frame, scene_frame
 from gsmerge.geometry.views import subset
 from gsmerge.plan import INPUT_STEPS, STAGE_STEPS, WHOLE_GAUSSIANS, Plan, plan_scene
+from gsmerge.prepare.row_colors import OWN_PHOTOS, PHOTOS
 from gsmerge.prepare.scene_size import SceneSize
+from gsmerge.raster.metrics import SAMPLE_LOSS, describe_loss, is_worse
 from gsmerge.raster.photos import blank_photos
+from gsmerge.results.report import CompactReport
 from gsmerge.results.result import CompactResult
 from gsmerge.results.scores import measure_result
-from gsmerge.runtime.memory import free_pages, memory_bytes
+from gsmerge.runtime.memory import free_pages, memory_bytes, peak_memory
 from gsmerge.runtime.record import (
     Record,
     RunPart,
@@ -30,10 +34,11 @@ from gsmerge.runtime.record import (
     stage,
 )
 from gsmerge.runtime.work import start_work
+from gsmerge.scoring.evaluate import evaluate
 from gsmerge.settings.budget import AUTO, parse_share, share_text
 from gsmerge.settings.compact import ONE_PIECE, CompactOptions
+from gsmerge.settings.evaluate import EvaluateOptions
 from gsmerge.special.blocks.fit_seams import fit_seams
-from gsmerge.special.blocks.join_reports import join_reports
 from gsmerge.special.blocks.partition import (
     Block,
     Covisibility,
@@ -95,7 +100,11 @@ def compact_blocks(
         note(f"compacted in {count} blocks of views: photos keep their exposures, and new views are not estimated")
     with stage("partition"):
         factors = count_factors(blocks, covisibility).tolist()
-        frame, options = scene_frame(scene), with_choices(options, plan)
+        frame = scene_frame(scene)
+        # Blocks take the steps of the fit, the networks and the density that were chosen for the whole scene
+        checkpoint = options.checkpoint if plan.settings["checkpoint"] != "none" else "none"
+        options = options.with_settings({"fit_steps": plan.fit.steps, "checkpoint": checkpoint})
+        options = replace(options, fit=replace(options.fit, share=plan.limits.share))
     size = gaussians_at_once(scene.num_gaussians, count)
     memory = memory_bytes(size, num_rest=3 * scene.gaussians.shN.shape[1])
     engine = options.blocks.engine
@@ -135,6 +144,43 @@ def compact_blocks(
     ]  # fmt: skip
     record_choices(blocks=facts)
     return CompactResult(result, join_reports(scene, result, starts, scores, options), scene.cameras)
+
+
+def join_reports(
+    scene: Scene,
+    gaussians: Gaussians,
+    starts: Sequence[BlockStart],
+    psnrs: Sequence[float | None],
+    options: CompactOptions,
+) -> CompactReport:
+    """Make the report of the whole scene. Its PSNR is the mean of the blocks' PSNR, weighted by their numbers of views.
+
+    ``psnrs`` has the PSNR (dB) of the result on the photos of each block, or None without photos. Seconds and notes
+    come from the current record. If the result may be worse than the input, result and input are scored again on all
+    photos.
+    """
+    run, num_views = current_record(), [len(start.block.own) for start in starts]
+
+    def mean(values: Sequence[float | None]) -> float | None:
+        """Average a value of each block, weighted by the blocks' numbers of views; None if a block has no value."""
+        numbers = [value for value in values if value is not None]
+        return None if len(numbers) < len(values) else float(np.average(numbers, weights=num_views))
+
+    scored = sum(len(start.plan.scored_views) for start, psnr in zip(starts, psnrs, strict=True) if psnr is not None)
+    before, after = mean([start.psnr_before for start in starts]), mean(psnrs)
+    reference = None if before is None else starts[0].prepared.reference.name
+    pictures = OWN_PHOTOS if reference == PHOTOS else reference
+    may_be_worse = reference == PHOTOS and is_worse(before, after, SAMPLE_LOSS)
+    if may_be_worse:
+        exact = evaluate(scene, {"result": gaussians}, options=EvaluateOptions(lpips=(), fog=False))
+        before, after = (scores.mean("context")[scene.masks is not None].psnr for scores in exact.results)
+    worse = None if pictures is None else describe_loss("the result", before, after, pictures)
+    return CompactReport(
+        num_input=scene.num_gaussians, num_output=len(gaussians), seconds=dict(run.seconds), psnr_before=before,
+        psnr_after=after, notes=[*run.notes, *([] if worse is None else [Doubt(worse, "worse")])],
+        choices=run.choices | {"scored_views": len(scene) if may_be_worse else scored, "scored_all": may_be_worse},
+        options=options.to_dict(), peak_memory_bytes=peak_memory(), worse=worse, psnr_reference=reference,
+    )  # fmt: skip
 
 
 def join_parts(parts: Sequence[Gaussians]) -> tuple[Gaussians, np.ndarray]:
@@ -213,7 +259,13 @@ def finish_joined(
     """Prune the canonical Gaussians of all blocks, move them into the world, meet the budget, and return them."""
     limit = plan.limits.count
     if plan.fit.min_contribution > 0:
-        joined = prune_joined(joined, frame.enter_cameras(cameras), options, limit)
+        # Gaussians that no camera sees are dropped. If the options fill the budget, as many of these are kept as the
+        # budget allows
+        seen, unseen = split_unseen(joined, frame.enter_cameras(cameras))
+        max_unseen = len(unseen) if limit is None else max(0, limit - len(seen))
+        unseen = unseen[: max_unseen if options.budget.is_filled else 0]
+        record_choices(pruned=len(joined) - len(seen) - len(unseen))
+        joined = Gaussians.concat([seen, unseen])
     result = frame.leave(joined)
     if limit is not None and limit < len(result):
         result = faintest_dropped(result, limit)
@@ -225,29 +277,9 @@ def finish_joined(
     return result
 
 
-def prune_joined(joined: Gaussians, cameras: Cameras, options: CompactOptions, limit: int | None) -> Gaussians:
-    """Drop the Gaussians that no camera sees.
-
-    If the options fill the budget of ``limit`` Gaussians, as many of the dropped Gaussians are kept as the budget
-    allows.
-    """
-    seen, unseen = split_unseen(joined, cameras)
-    max_unseen = len(unseen) if limit is None else max(0, limit - len(seen))
-    unseen = unseen[: max_unseen if options.budget.is_filled else 0]
-    record_choices(pruned=len(joined) - len(seen) - len(unseen))
-    return Gaussians.concat([seen, unseen])
-
-
 def free_scene(scene: Scene) -> None:
     """Release the memory of the arrays of a scene that are kept in files, from which they are read again if needed."""
     free_pages([*vars(scene.gaussians).values(), *([] if scene.images is None else [scene.images])])
-
-
-def with_choices(options: CompactOptions, plan: Plan) -> CompactOptions:
-    """Return options with the steps of the fit, the networks and the density that were chosen for the whole scene."""
-    checkpoint = options.checkpoint if plan.settings["checkpoint"] != "none" else "none"
-    options = options.with_settings({"fit_steps": plan.fit.steps, "checkpoint": checkpoint})
-    return replace(options, fit=replace(options.fit, share=plan.limits.share))
 
 
 def block_options(

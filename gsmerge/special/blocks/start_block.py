@@ -43,7 +43,12 @@ def start_block(
     prepared = prepare(piece, options.prepare, frame)
     plan = make_plan(prepared, options)
     decoded = merge_views(prepared, plan, plan.limits.count)
-    keep = belongs_to_block(frame.leave(decoded.gaussians).means, block, covisibility)
+    # The owner of a Gaussian is searched among the views that share surfaces with the block, because other views do not
+    # see the Gaussian
+    is_candidate = covisibility.weights[list(block.own)].sum(0) > 0
+    is_candidate[list(block.own)] = True
+    means, candidates = frame.leave(decoded.gaussians).means, np.flatnonzero(is_candidate).tolist()
+    keep = np.isin(owning_views(means, covisibility, candidates), block.own)
     before = measure_input(prepared, plan)
     return BlockStart(
         block=block,
@@ -53,18 +58,6 @@ def start_block(
         plan=plan,
         psnr_before=None if before is None else before.psnr,
     )
-
-
-def belongs_to_block(means: np.ndarray, block: Block, covisibility: Covisibility) -> np.ndarray:
-    """Return a mask ``[n]`` of the means ``[n,3]`` whose owner is a view that belongs to the block.
-
-    The owner is searched among the views that share surfaces with the block, because other views do not see these
-    means.
-    """
-    is_candidate = covisibility.weights[list(block.own)].sum(0) > 0
-    is_candidate[list(block.own)] = True
-    owners = owning_views(means, covisibility, np.flatnonzero(is_candidate).tolist())
-    return np.isin(owners, block.own)
 
 
 def without_gaussians(prepared: Prepared) -> Prepared:
