@@ -163,7 +163,16 @@ def spline(cameras: Cameras, depth: float, count: int) -> Cameras:
     curve is a centripetal Catmull-Rom spline (Barry and Goldman 1988) of positions and quaternions. Intrinsics change
     linearly. Raises ValueError if there are fewer than two different cameras.
     """
-    poses, is_new = _pose_rows(cameras, depth)
+    # The distance of two rows of ``poses [c,7]`` measures how much the poses differ. A row has the camera's position,
+    # and the camera's quaternion times twice the depth, so that a small rotation changes a row by the angle times the
+    # depth. A quaternion has the sign with which it is nearer to the quaternion of the row before
+    quats = rotmat_to_quat(cameras.viewmats[:, :3, :3].astype(np.float64).swapaxes(1, 2))
+    opposite = (quats[1:] * quats[:-1]).sum(1) < 0
+    quats[1:] *= np.where(opposite, -1, 1).cumprod()[:, None]
+    poses = np.concatenate([camera_centres(cameras.viewmats), 2 * depth * quats], 1)
+    steps = _lengths(np.diff(poses, axis=0))
+    tolerance = 1e-9  # poses count as equal up to this distance, as a share of a path's length
+    is_new = np.concatenate([[True], steps > tolerance * max(steps.sum(), depth)])  # a pose differs from the one before
     origin, poses, Ks = poses[0, :3].copy(), poses[is_new], cameras.Ks[is_new].astype(np.float64)
     if len(poses) < 2:
         raise ValueError("spline: expected at least 2 different cameras, got 1; use an orbit, which needs one")
@@ -177,29 +186,16 @@ def spline(cameras: Cameras, depth: float, count: int) -> Cameras:
     pieces, shares = _pieces(knots, times)
     weights = shares[:, None, None]
     path_Ks = (1 - weights) * Ks[pieces] + weights * Ks[pieces + 1]
-    return replace(cameras, viewmats=_viewmats(rotations, origin + path_poses[:, :3]), Ks=path_Ks)
-
-
-def _pose_rows(cameras: Cameras, depth: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return poses as rows ``[c,7]``, and a mask ``[c]`` of the poses that differ from the one before.
-
-    The distance of two rows measures how much their poses differ. A row has the camera's position, and the camera's
-    quaternion times twice the depth, so that a small rotation changes a row by the angle times the depth. A quaternion
-    has the sign with which it is nearer to the quaternion of the row before.
-    """
-    quats = rotmat_to_quat(cameras.viewmats[:, :3, :3].astype(np.float64).swapaxes(1, 2))
-    opposite = (quats[1:] * quats[:-1]).sum(1) < 0
-    quats[1:] *= np.where(opposite, -1, 1).cumprod()[:, None]
-    rows = np.concatenate([camera_centres(cameras.viewmats), 2 * depth * quats], 1)
-    steps = _lengths(np.diff(rows, axis=0))
-    tolerance = 1e-9  # poses count as equal up to this distance, as a share of a path's length
-    return rows, np.concatenate([[True], steps > tolerance * max(steps.sum(), depth)])
+    viewmats = np.tile(np.eye(4), (count, 1, 1))
+    viewmats[:, :3, :3] = rotations
+    viewmats[:, :3, 3] = -(rotations * (origin + path_poses[:, :3])[:, None]).sum(-1)
+    return replace(cameras, viewmats=viewmats, Ks=path_Ks)
 
 
 def _curve(rows: np.ndarray, knots: np.ndarray, times: np.ndarray, depth: float) -> np.ndarray:
     """Evaluate a spline that passes the poses ``rows [c,7]`` at the times ``knots [c]``.
 
-    Returns its poses ``[m,7]`` at ``times [m]``, as rows of :func:`_pose_rows` for ``depth``.
+    Returns its poses ``[m,7]`` at ``times [m]``, as rows of :func:`spline` for ``depth``.
     """
     steps = np.diff(knots)[:, None]
     slopes = np.diff(rows, axis=0) / steps
@@ -234,11 +230,3 @@ def _at_equal_steps(points: np.ndarray, times: np.ndarray, shares: np.ndarray) -
 def _lengths(vectors: np.ndarray) -> np.ndarray:
     """Return the lengths of vectors along the last axis."""
     return np.sqrt((vectors * vectors).sum(-1))
-
-
-def _viewmats(rotations: np.ndarray, centres: np.ndarray) -> np.ndarray:
-    """Make world-to-camera matrices ``[n,4,4]`` from rotations ``[n,3,3]`` and camera centres ``[n,3]``."""
-    out = np.tile(np.eye(4), (len(centres), 1, 1))
-    out[:, :3, :3] = rotations
-    out[:, :3, 3] = -(rotations * centres[:, None]).sum(-1)
-    return out

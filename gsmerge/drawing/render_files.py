@@ -225,7 +225,15 @@ def prepare_clip(options: DrawOptions) -> Drawing:
     facts |= {"frames": len(cameras), "width": cameras.width, "height": cameras.height}
     if options.output.suffix.lower() not in CLIPS:
         return Drawing([options.output / f"frame_{i:05d}.png" for i in range(len(cameras))], facts, draw)
-    _check_frames(options.output, cameras.width, cameras.height, len(cameras))
+    # A clip with more or larger frames would take too much memory to encode
+    if cameras.width * cameras.height > MAX_VIDEO_PIXELS:
+        size = f"{cameras.width} x {cameras.height}"
+        problem = f"expected at most {MAX_VIDEO_PIXELS:,} pixels per frame of a video, found {size}"
+        raise SceneError(options.output, problem, FOLDER_HINT)
+    if options.output.suffix.lower() == GIF and len(cameras) * cameras.width * cameras.height > MAX_GIF_PIXELS:
+        size = f"{len(cameras)} x {cameras.width} x {cameras.height}"
+        problem = f"expected at most {MAX_GIF_PIXELS:,} pixels in a GIF, found {size}"
+        raise SceneError(options.output, problem, "lower --size or --frames, or name a .mp4")
     width, height = stored_size(options.output, cameras.width, cameras.height)
     if (width, height) != (cameras.width, cameras.height):
         group.notes.append(
@@ -233,16 +241,6 @@ def prepare_clip(options: DrawOptions) -> Drawing:
             " column repeated, since a video has even sides"
         )
     return Drawing([options.output], facts | {"width": width, "height": height, "fps": options.fps}, draw)
-
-
-def _check_frames(output: Path, width: int, height: int, count: int) -> None:
-    """Raise SceneError if the ``count`` frames of a clip would take too much memory to encode."""
-    if width * height > MAX_VIDEO_PIXELS:
-        problem = f"expected at most {MAX_VIDEO_PIXELS:,} pixels per frame of a video, found {width} x {height}"
-        raise SceneError(output, problem, FOLDER_HINT)
-    if output.suffix.lower() == GIF and count * width * height > MAX_GIF_PIXELS:
-        problem = f"expected at most {MAX_GIF_PIXELS:,} pixels in a GIF, found {count} x {width} x {height}"
-        raise SceneError(output, problem, "lower --size or --frames, or name a .mp4")
 
 
 def _make_path(options: DrawOptions) -> tuple[DrawnScenes, Cameras, float, list[int]]:
@@ -259,8 +257,11 @@ def _make_path(options: DrawOptions) -> tuple[DrawnScenes, Cameras, float, list[
     if is_scene_file:
         options = replace(options, framing=replace(options.framing, cameras=file))
     group = _read_scenes(options, photos=False)
-    scene_cameras = group.load.scene.cameras
-    cameras = scene_cameras if file is None or is_scene_file else _place_file(file, group.load)
+    cameras = scene_cameras = group.load.scene.cameras
+    if file is not None and not is_scene_file:  # cameras without image sizes get the scene's size
+        stored = read_cameras(file) if group.load.cameras is None else read_into_frame(group.load, file)[0]
+        size = None if sizes_of(stored) else (scene_cameras.width, scene_cameras.height)
+        cameras = to_cameras(replace(stored, lenses=()), size)
     assert not isinstance(options.views, str)
     ids = pick_views(len(cameras), options.views or len(cameras))
     cameras = cameras[ids]
@@ -273,16 +274,6 @@ def _make_path(options: DrawOptions) -> tuple[DrawnScenes, Cameras, float, list[
         except ValueError as error:
             raise UsageError(str(error)) from error
     return group, cameras, NEAR_PLANE * depth, ids
-
-
-def _place_file(file: Path, load: Loaded) -> Cameras:
-    """Read the cameras of a path from a file into the frame of a scene.
-
-    If the file has no image sizes, the cameras get the scene's size.
-    """
-    cameras = load.scene.cameras
-    stored = read_cameras(file) if load.cameras is None else read_into_frame(load, file)[0]
-    return to_cameras(replace(stored, lenses=()), None if sizes_of(stored) else (cameras.width, cameras.height))
 
 
 DRAWINGS = {"panel": prepare_panel, "views": prepare_pictures, "path": prepare_clip}
@@ -300,25 +291,19 @@ def _read_scenes(options: DrawOptions, *, photos: bool) -> DrawnScenes:
     plys = [read_gaussians(path, opacity=options.opacity, **hints) for path in paths[1:]]
     same_file = framing.ply == files.ply
     framing_ply = first_ply if same_file else read_gaussian_file(framing, opacity="auto", hints=NO_HINTS)
-    framing_load = move_cameras_to_scene(framing_ply, framing, hints=options.hints, photos=photos)
-    load = _with_views(framing_load, inside=photos)
+    load = move_cameras_to_scene(framing_ply, framing, hints=options.hints, photos=photos)
+    if len(load.scene) == 0:
+        placed = f"no cameras: views are placed {'around and inside' if photos else 'around'} the scene"
+        with record_run() as record:
+            scene = add_views(load.scene, shown=True, placed=placed)
+        scene = scene if photos else subset(scene, range(len(scene) // 2))  # the other views are inside the scene
+        scene = replace(scene, cameras=fill_cameras(scene.cameras, *PLACED_SIZE))
+        load = replace(load, scene=scene, notes=(*load.notes, *record.notes))
     scenes = [load.scene.file_gaussians if same_file else first_ply.gaussians, *(ply.gaussians for ply in plys)]
     notes = [[*([] if same_file else file_notes(first_ply.info)), *load.notes], *(file_notes(ply.info) for ply in plys)]
     notes_with_paths = [note for path, texts in zip(paths, notes, strict=True) for note in name_notes(path, texts)]
     sizes = [file.info.file_bytes for file in (first_ply, *plys)]
     return DrawnScenes(list(zip(paths, scenes, strict=True)), sizes, notes_with_paths if plys else list(notes[0]), load)
-
-
-def _with_views(load: Loaded, *, inside: bool) -> Loaded:
-    """Place views around a scene that has no views, and if ``inside`` also inside the scene."""
-    if len(load.scene):
-        return load
-    placed = f"no cameras: views are placed {'around and inside' if inside else 'around'} the scene"
-    with record_run() as record:
-        scene = add_views(load.scene, shown=True, placed=placed)
-    scene = scene if inside else subset(scene, range(len(scene) // 2))
-    scene = replace(scene, cameras=fill_cameras(scene.cameras, *PLACED_SIZE))
-    return replace(load, scene=scene, notes=(*load.notes, *record.notes))
 
 
 def find_view(view: str, names: Sequence[str]) -> int:

@@ -139,7 +139,17 @@ def collect_page_data(
     with use_threads():
         data = _fill_page(title, scene, results, file_bytes, held_out, evaluation, stills, light=light)
     progress("done", 0, 0)
-    return _with_gains(data, new_gains or {})
+    gains, sides, notes = new_gains or {}, [], list[str]()
+    for side in data.sides:
+        gain = gains.get(side.name)
+        if gain is not None and not data.held_out and is_worse(data.sides[0].mean.psnr, side.mean.psnr):
+            gain = None
+            notes.append(
+                f"{side.name} shows these photos worse than {data.title} does, so its expected gain of new views is"
+                " left out; is it a result of this scene?"
+            )
+        sides.append(replace(side, new_gain=gain))
+    return replace(data, sides=tuple(sides), notes=(*data.notes, *notes))
 
 
 def _fill_page(
@@ -170,7 +180,19 @@ def _fill_page(
         splits["target"] = held_out.cameras.numpy(), held_out.images, held_out.names
     views = _list_views(splits, evaluation, stills, frame, means)
     shown = _choose_shown(views)
-    outside = _draw_outside_view(scene, named, frame, len(views))
+    camera, distance = outside_camera(scene.cameras.numpy(), named[INPUT].means)
+    renders = (render(gaussians, camera, near=NEAR_PLANE * frame.unit) for gaussians in named.values())
+    outside = PageView(
+        name=OUTSIDE_VIEW,
+        place=len(views),
+        held_out=False,
+        camera=frame.enter_cameras(camera),
+        distance=distance / frame.unit,
+        photo=None,
+        stills=tuple(encode_still(to_picture(drawing.images[0])) for drawing in renders),
+        scores=(),
+        outside=True,
+    )
     result_notes = evaluation.notes if results else ()  # notes of an evaluation concern results
     notes = (*result_notes, *_list_limits(sides, len(shown), len(views)))
     covered_share, _ = evaluation.results[0].mean_covered("context")
@@ -180,24 +202,6 @@ def _fill_page(
         title, tuple(sides), shown, outside, len(views), evaluation.reference, notes,
         lacks_pixels, agreement,
     )  # fmt: skip
-
-
-def _with_gains(data: ViewData, gains: Mapping[str, tuple[float, float]]) -> ViewData:
-    """Return the content with the expected gains of results.
-
-    If a result shows the photos of the fit worse than the scene does, it gets a note instead of a gain.
-    """
-    sides, notes = [], list[str]()
-    for side in data.sides:
-        gain = gains.get(side.name)
-        if gain is not None and not data.held_out and is_worse(data.sides[0].mean.psnr, side.mean.psnr):
-            gain = None
-            notes.append(
-                f"{side.name} shows these photos worse than {data.title} does, so its expected gain of new views is"
-                " left out; is it a result of this scene?"
-            )
-        sides.append(replace(side, new_gain=gain))
-    return replace(data, sides=tuple(sides), notes=(*data.notes, *notes))
 
 
 def _list_views(
@@ -223,26 +227,6 @@ def _list_views(
     return views
 
 
-def _draw_outside_view(scene: Scene, named: Mapping[str, Gaussians], frame: Frame, place: int) -> PageView:
-    """Draw the scene and its results from outside the capture, as view ``place`` of the page.
-
-    ``named`` are the Gaussians of the scene and of the results, in the scene's world.
-    """
-    camera, distance = outside_camera(scene.cameras.numpy(), named[INPUT].means)
-    renders = (render(gaussians, camera, near=NEAR_PLANE * frame.unit) for gaussians in named.values())
-    return PageView(
-        name=OUTSIDE_VIEW,
-        place=place,
-        held_out=False,
-        camera=frame.enter_cameras(camera),
-        distance=distance / frame.unit,
-        photo=None,
-        stills=tuple(encode_still(to_picture(drawing.images[0])) for drawing in renders),
-        scores=(),
-        outside=True,
-    )
-
-
 def short_names(names: Sequence[str]) -> list[str]:
     """Remove folders and endings from photo names, if all short names differ."""
     stems = [PurePosixPath(name.replace("\\", "/")).stem or name for name in names]
@@ -253,26 +237,6 @@ def encode_still(picture: BytePicture) -> bytes:
     """Encode a picture as WebP."""
     webp_quality = 90  # stills of this quality score within 1 dB of lossless stills
     return encode_picture(picture, webp_quality)
-
-
-def _pack_side(
-    gaussians: Gaussians, name: str, scene: Scene, cameras: Cameras, light: bool
-) -> tuple[bytes | None, int, int]:
-    """Pack one side's Gaussians for the page; return the bytes, and the SH degrees in the page and in the file.
-
-    ``gaussians`` and ``cameras`` are in the canonical frame. A ``light`` page leaves out the Gaussians of the scene
-    itself, and the bytes are then None.
-    """
-    highest = highest_degree(gaussians.shN)
-    if name != INPUT:
-        return *pack_splats(gaussians), highest
-    if light:
-        return None, highest, highest
-    homes = None
-    if scene.has_own_pixels:
-        homes = scene.get_pixels().homes
-        homes = homes if scene.filled is None else homes[~scene.filled]  # without rows that the file does not have
-    return *pack_splats(gaussians, cameras, homes), highest
 
 
 def _collect_side(
@@ -289,7 +253,17 @@ def _collect_side(
 
     ``gaussians`` and ``cameras`` are in the canonical frame.
     """
-    splats, sh_degree, file_sh_degree = _pack_side(gaussians, result.name, scene, cameras, light)
+    file_sh_degree = highest_degree(gaussians.shN)
+    if result.name != INPUT:
+        splats, sh_degree = pack_splats(gaussians)
+    elif light:  # the page shows the scene itself in pictures only
+        splats, sh_degree = None, file_sh_degree
+    else:
+        homes = None
+        if scene.has_own_pixels:
+            homes = scene.get_pixels().homes
+            homes = homes if scene.filled is None else homes[~scene.filled]  # without rows that the file does not have
+        splats, sh_degree = pack_splats(gaussians, cameras, homes)
     covered_share, covered = result.mean_covered(split)
     return Side(
         name=result.name,

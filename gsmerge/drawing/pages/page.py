@@ -35,7 +35,12 @@ MISSING = "-"  # replaces a missing figure
 def view_page(data: ViewData) -> bytes:
     """Make the HTML page of a scene and its results, in UTF-8."""
     has_photos = any(view.photo is not None for view in data.views)
-    sources = _list_sources(data, has_photos)
+    # What can be chosen for each half of the page: the photos if there are any, the scene itself, each result
+    picture = "own colours" if data.reference == ROW_COLORS else "photo"
+    sources: list[dict[str, Any]] = [{"name": picture, "splats": None, "count": 0}] if has_photos else []
+    for i, side in enumerate(data.sides):
+        splats_id = None if side.splats is None else f"splats-{i}"
+        sources.append({"name": side.name, "splats": splats_id, "count": side.num_gaussians})
     right = min(int(has_photos) + 1, len(sources) - 1)  # the first result, with the scene itself to its left
     left = max(right - 1, 0)
     pictures = [(view.photo, *view.stills)[not has_photos :] for view in data.shown]
@@ -79,18 +84,6 @@ def view_page(data: ViewData) -> bytes:
         engine=base64_text(VIEWER.read_bytes()) if splats else None,
     )
     return page.encode()
-
-
-def _list_sources(data: ViewData, has_photos: bool) -> list[dict[str, Any]]:
-    """List what can be chosen for each half of the page: the photos if there are any, the scene itself, each result."""
-    picture = "own colours" if data.reference == ROW_COLORS else "photo"
-    sources: list[dict[str, Any]] = [{"name": picture, "splats": None, "count": 0}] if has_photos else []
-    return sources + [
-        {
-            "name": side.name, "splats": None if side.splats is None else f"splats-{i}", "count": side.num_gaussians
-        }
-        for i, side in enumerate(data.sides)
-    ]  # fmt: skip
 
 
 def _result_entry(data: ViewData, side_id: int) -> dict[str, Any]:
@@ -203,29 +196,15 @@ def list_figures(data: ViewData, side_id: int) -> list[Figure]:
     for label, name, old_quality, new_quality in qualities:
         if any(getattr(side.mean, name) is not None for side in data.sides[1:] or data.sides):
             old, new = getattr(old_quality, name), getattr(new_quality, name)
-            scores.append(_score_figure(label, name, old, new, own=own, is_result=side_id > 0))
+            digits, unit = (2, " dB") if name == "psnr" else (3, "")
+            is_better = side_id > 0 and old is not None and new is not None and old < new
+            mark = "own" if own else "up" if is_better else ""
+            scores.append(Figure(label, _format_number(old, digits), _format_number(new, digits) + unit, mark))
     if is_expected:
         gain = after.new_gain
         words = MISSING if gain is None else "{:+.1f} to {:+.1f} dB".format(*gain)
         figures.append(Figure("New views, expected", "", words, "up" if gain is not None and gain[0] > 0 else ""))
     return figures + (scores if data.scored else [])
-
-
-def _score_figure(label: str, name: str, old: float | None, new: float | None, *, own: bool, is_result: bool) -> Figure:
-    """Make the figure of a mean score, which is ``old`` for the scene itself and ``new`` for one side (scene or result)
-    of the page.
-
-    ``label`` is shown, and ``name`` is the metric. ``own`` is True if scores are measured on the photos that the fit
-    used. ``is_result`` is True if the side is not the scene itself.
-    """
-    digits, unit = (2, " dB") if name == "psnr" else (3, "")
-    is_better = is_result and old is not None and new is not None and old < new
-    return Figure(
-        label,
-        _format_number(old, digits),
-        _format_number(new, digits) + unit,
-        "own" if own else "up" if is_better else "",
-    )
 
 
 def reference_words(data: ViewData) -> tuple[str, bool]:
@@ -310,16 +289,13 @@ def render_template(name: str, policy: str, **values: Any) -> str:
     """
     text = _environment().get_template(name).render(version=__version__, **values)
     text = text.encode("utf-8", "replace").decode("utf-8")  # names of files may have lone surrogates
-    hashes = {kind: " ".join(_hashes(text, kind)) for kind in ("script", "style")}
+    hashes = {}
+    for kind in ("script", "style"):
+        # Elements with a type attribute hold data, which a browser does not run
+        contents = re.findall(f"<{kind}>(.*?)</{kind}>", text, re.DOTALL)
+        digests = dict.fromkeys(hashlib.sha256(content.encode()).digest() for content in contents)
+        hashes[kind] = " ".join(f"'sha256-{base64_text(digest)}'" for digest in digests)
     return text.replace(POLICY_MARK, html.escape(policy.format(**hashes)), 1)
-
-
-def _hashes(page: str, kind: str) -> list[str]:
-    """Return hashes of a page's "script" or "style" elements (``kind``), as a content security policy names them."""
-    # Elements with a type attribute hold data, which a browser does not run
-    contents = re.findall(f"<{kind}>(.*?)</{kind}>", page, re.DOTALL)
-    digests = [hashlib.sha256(content.encode()).digest() for content in contents]
-    return [f"'sha256-{base64_text(digest)}'" for digest in dict.fromkeys(digests)]
 
 
 @cache

@@ -52,13 +52,6 @@ def measure(gaussians: Gaussians, cameras: Cameras, comments: Sequence[str]) -> 
     return len(make_page(gaussians, cameras, "x" * longest_title, comments).encode())
 
 
-def _read_licences() -> bytes:
-    """Join the licences of the viewer's parts to one text."""
-    vendor = resources.files("gsmerge.drawing.pages").joinpath("vendor")
-    texts = [f"{name}\n\n{vendor.joinpath(f'LICENSE.{name}').read_text('utf-8')}" for name in LICENSED]
-    return "\n\n".join(texts).encode()
-
-
 def make_page(gaussians: Gaussians, cameras: Cameras, title: str, comments: Sequence[str]) -> str:
     """Make the HTML of a page. Without cameras, gsmerge places viewpoints, and the user may look from any side."""
     expected = read_expected_scores(comments)
@@ -67,10 +60,13 @@ def make_page(gaussians: Gaussians, cameras: Cameras, title: str, comments: Sequ
     start = 0 if is_free else median_camera(viewpoints)  # the first of the placed viewpoints is outside the scene
     poster = encode_still(to_picture(render(gaussians.numpy(), viewpoints[[start]]).images[0]))
     views = sorted({*even_views(len(viewpoints), min(len(viewpoints), MAX_VIEWPOINTS)), start})
+    vendor = resources.files("gsmerge.drawing.pages").joinpath("vendor")
+    texts = [f"{name}\n\n{vendor.joinpath(f'LICENSE.{name}').read_text('utf-8')}" for name in LICENSED]
+    licences = "\n\n".join(texts).encode()
     files = {"engine": VIEWER.read_bytes(), "scene": sog_bytes(gaussians, Contents([gaussians], comments))}
     return render_template(
         "site.html", policy=SITE_POLICY, title=title, count=len(gaussians), names=NAMES,
-        poster=data_uri(poster, "image/webp"), licences=data_uri(_read_licences(), "text/plain"),
+        poster=data_uri(poster, "image/webp"), licences=data_uri(licences, "text/plain"),
         inside={NAMES[name]: base64_text(content) for name, content in files.items()},
         gain=None if expected is None else describe_gain(*expected.bounds),
         download=f"{title}.sog",

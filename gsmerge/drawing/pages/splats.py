@@ -56,42 +56,40 @@ def pack_splats(
     head: dict[str, Any] = {"count": count, "degree": degree, "fraction": fraction}
     positions = None
     if cameras is not None and homes is not None and (homes >= 0).all():
-        positions = _pixel_positions(rows, means, cameras, homes.astype(np.int64, copy=False))
+        # Row 0 has the pixels, rows 1 and 2 the shifts within them, and row 3 the logarithms of the depths
+        in_pixels = np.empty((4, count), np.uint32)
+        viewmats, Ks = (np.ascontiguousarray(array, np.float64) for array in (cameras.viewmats, cameras.Ks))
+        sizes = (cameras.width, cameras.height, PIXEL_PARTS, DEPTH_PARTS)
+        num_packed = pack_pixels(rows, homes.astype(np.int64, copy=False), means, viewmats, Ks, *sizes, in_pixels)
+        if num_packed == count:  # otherwise a Gaussian cannot be stored like this, for example behind its camera
+            positions = in_pixels
+            # With these entries the page's script computes positions from pixels and depths
+            poses = [
+                {"viewmat": viewmat.reshape(-1).tolist(), "K": [K[0, 0].item(), K[1, 1].item(), *K[:2, 2].tolist()]}
+                for viewmat, K in zip(cameras.viewmats, cameras.Ks, strict=True)
+            ]
+            size = {"width": cameras.width, "height": cameras.height}
+            head |= {"cameras": poses, **size, "parts": [PIXEL_PARTS, DEPTH_PARTS]}
     if positions is None:
         changes = np.diff(spz.quantise_means(drawn_means, fraction), axis=0, prepend=np.zeros((1, 3), np.int32)).T
         positions = np.where(changes < 0, -2 * changes - 1, 2 * changes).astype("<u4")
-    elif cameras is not None:
-        head |= _camera_head(cameras)
     looks = np.empty((LOOKS + _num_harmonics(degree), count), np.uint32)
     arrays = (gaussians.opacities, gaussians.sh0, gaussians.scales, gaussians.quats, gaussians.shN)
     columns = (np.ascontiguousarray(array.reshape(len(array), prod(array.shape[1:])), np.float32) for array in arrays)
     pack_looks(rows, *columns, SH_C0, spz.COLOR_SCALE, np.array(steps, np.int32), levels, looks)  # fills looks
-    packed = [_pack_column(column) for column in (*positions, *looks)]
-    head |= {"steps": steps, "levels": levels, "sizes": [size for size, _ in packed]}
-    line = json.dumps(head).encode() + b"\n"
-    content = line + b"".join(planes for _, planes in packed)
+    column_bytes, planes = list[int](), list[bytes]()  # bytes per number of each column, and the columns
+    for column in (*positions, *looks):
+        num_bytes = max(1, -(-int(column.max(initial=0)).bit_length() // 8))
+        column_bytes.append(num_bytes)
+        planes.append(column.astype("<u4").view(np.uint8).reshape(-1, 4)[:, :num_bytes].T.tobytes())
+    head |= {"steps": steps, "levels": levels, "sizes": column_bytes}
+    content = json.dumps(head).encode() + b"\n" + b"".join(planes)
     return spz.gzip_bytes([content], level=1, strategy=zlib.Z_RLE), degree  # longer matches are rare in differences
 
 
 def _num_harmonics(degree: int) -> int:
     """Return the number of values of shN at a degree: three channels of each harmonic."""
     return 3 * ((degree + 1) ** 2 - 1)
-
-
-def _camera_head(cameras: Cameras) -> dict[str, Any]:
-    """Return the entries of the JSON with which the page's script computes positions from pixels and depths."""
-    poses = [
-        {"viewmat": viewmat.reshape(-1).tolist(), "K": [K[0, 0].item(), K[1, 1].item(), K[0, 2].item(), K[1, 2].item()]}
-        for viewmat, K in zip(cameras.viewmats, cameras.Ks, strict=True)
-    ]
-    size = {"width": cameras.width, "height": cameras.height}
-    return {"cameras": poses, **size, "parts": [PIXEL_PARTS, DEPTH_PARTS]}
-
-
-def _pack_column(column: np.ndarray) -> tuple[int, bytes]:
-    """Pack a column ``[m]``; return the bytes per number, and the packed bytes: low bytes of all numbers come first."""
-    size = max(1, -(-int(column.max(initial=0)).bit_length() // 8))
-    return size, column.astype("<u4").view(np.uint8).reshape(-1, 4)[:, :size].T.tobytes()
 
 
 def drawn_rows(gaussians: Gaussians) -> np.ndarray:
@@ -101,19 +99,6 @@ def drawn_rows(gaussians: Gaussians) -> np.ndarray:
         finite = np.isfinite(values).reshape(len(values), prod(values.shape[1:])).T
         drawn &= reduce(np.logical_and, finite, True)  # type: ignore[arg-type]
     return np.flatnonzero(drawn)
-
-
-def _pixel_positions(rows: np.ndarray, means: np.ndarray, cameras: Cameras, homes: np.ndarray) -> np.ndarray | None:
-    """Return where the Gaussians ``rows [m]`` are, relative to their pixels; ``homes [n]`` are the pixels of all rows.
-
-    Row 0 of the result ``[4,m]`` has the pixels, rows 1 and 2 the shifts within them, and row 3 the logarithms of the
-    depths. The result is None if a Gaussian cannot be stored like this, for example if it is behind its camera.
-    """
-    positions = np.empty((4, len(rows)), np.uint32)
-    viewmats, Ks = (np.ascontiguousarray(array, np.float64) for array in (cameras.viewmats, cameras.Ks))
-    sizes = (cameras.width, cameras.height, PIXEL_PARTS, DEPTH_PARTS)
-    num_packed = pack_pixels(rows, homes, means, viewmats, Ks, *sizes, positions)
-    return positions if num_packed == len(rows) else None
 
 
 def highest_degree(harmonics: np.ndarray) -> int:
