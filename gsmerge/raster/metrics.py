@@ -107,7 +107,7 @@ def ssim(image: Array, reference: Array, mask: Array | None = None) -> float:
     The result is the mean over channels and over the windows that lie wholly inside the image, as computed by
     scikit-image's ``structural_similarity(gaussian_weights=True, sigma=1.5, use_sample_covariance=False,
     channel_axis=-1, data_range=1)``. The function ``ssim`` is for measuring only. The loss of the full fit and of
-    training has its own definition, :func:`gsmerge.fit.loss.loss_ssim`.
+    training has its own definition, :func:`gsmerge.research.training.losses.loss_ssim`.
 
     Images are ``[h,w,c]`` with at most 4 channels. ``mask [h,w]`` selects windows by their centres, but a window also
     contains the pixels around its centre. Raises ValueError if shapes differ, the image is too small or no window is

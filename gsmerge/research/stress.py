@@ -219,8 +219,24 @@ def _check_case(
         result = base if case.name == "unchanged" else _compact_and_score(changed, options)
     except (GsmergeError, ValueError) as error:  # a case that fails must not end the others
         return False, f"ended with: {error}"
-    defect = _find_defect(result.gaussians, changed.scene)
-    return (False, defect) if defect else _check_result(case, base, result, _fit_slack(options))
+    if not 1 <= len(result.gaussians) <= changed.scene.num_gaussians:
+        return False, f"{len(result.gaussians)} Gaussians of {changed.scene.num_gaussians}"
+    columns = [name for name, column in vars(result.gaussians).items() if not np.isfinite(column).all()]
+    if columns:
+        return False, f"{', '.join(columns)} are not finite"
+    # The result is compared with its own input, or with the result of the unchanged scene
+    figures = f"{len(result.gaussians):,} Gaussians, {result.after:.2f} dB"
+    if case.check == "better":
+        if math.isinf(result.before):
+            return True, f"{figures} against renders of the input"
+        return result.after >= result.before - MAX_WORSE, f"{figures}; its input {result.before:.2f} dB"
+    count_holds = {
+        "once": result.count <= ONCE_COUNT * base.count,
+        "same": abs(result.count - base.count) <= max(1, SAME_COUNT * base.count),
+    }
+    max_loss = MAX_NEAR if case.check == "near" else MAX_SAME
+    holds = count_holds.get(case.check, True) and result.after >= base.after - max_loss - _fit_slack(options)
+    return holds, f"{figures}; unchanged {len(base.gaussians):,}, {base.after:.2f} dB"
 
 
 def _compact_and_score(setup: StressScene, options: CompactOptions) -> _ScoredResult:
@@ -247,26 +263,6 @@ def _fit_slack(options: CompactOptions) -> float:
     return fit_slack if options.fit.fit == "full" else 0.0
 
 
-def _check_result(case: Case, base: _ScoredResult, result: _ScoredResult, slack: float) -> tuple[bool, str]:
-    """Compare a result with its own input, or with the result ``base`` of the unchanged scene, as the case requires.
-
-    Returns True if the property of the case holds, and the compared figures. ``slack`` is how many dB more than usual a
-    result may lose because of its fit.
-    """
-    figures = f"{len(result.gaussians):,} Gaussians, {result.after:.2f} dB"
-    with_base = f"{figures}; unchanged {len(base.gaussians):,}, {base.after:.2f} dB"
-    if case.check == "better":
-        if math.isinf(result.before):
-            return True, f"{figures} against renders of the input"
-        return result.after >= result.before - MAX_WORSE, f"{figures}; its input {result.before:.2f} dB"
-    count_holds = {
-        "once": result.count <= ONCE_COUNT * base.count,
-        "same": abs(result.count - base.count) <= max(1, SAME_COUNT * base.count),
-    }
-    max_loss = MAX_NEAR if case.check == "near" else MAX_SAME
-    return count_holds.get(case.check, True) and result.after >= base.after - max_loss - slack, with_base
-
-
 def _check_again(setup: StressScene, base: _ScoredResult, options: CompactOptions) -> tuple[bool, str]:
     """Compact the result ``base`` a second time to the same number of Gaussians, and check that the quality stays.
 
@@ -278,11 +274,3 @@ def _check_again(setup: StressScene, base: _ScoredResult, options: CompactOption
     settings = replace(options, budget=same_count, decode=replace(options.decode, k=1))
     after = _measure_all_views(setup, compact(unaligned, settings).gaussians)[1]
     return after >= base.after - MAX_SAME - _fit_slack(options), f"{after:.2f} dB; before {base.after:.2f} dB"
-
-
-def _find_defect(gaussians: Gaussians, scene: Scene) -> str | None:
-    """Describe the defect of a result, or return None if the result has no defect."""
-    if not 1 <= len(gaussians) <= scene.num_gaussians:
-        return f"{len(gaussians)} Gaussians of {scene.num_gaussians}"
-    columns = [name for name, column in vars(gaussians).items() if not np.isfinite(column).all()]
-    return f"{', '.join(columns)} are not finite" if columns else None

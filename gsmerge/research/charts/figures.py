@@ -17,7 +17,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from gsmerge.io import atomic_output
-from gsmerge.research.charts.lines import CHART_METRICS, MIN_SCENES, PARTS, Interval, Line, Results
+from gsmerge.research.charts.lines import CHART_METRICS, MIN_SCENES, PARTS, Line, Results
 from gsmerge.research.charts.measure_run import INPUT
 
 PANEL_WIDTH, SINGLE_WIDTH, PANEL_HEIGHT = 2.9, 4.4, 2.5  # inches: one of several panels, the only panel
@@ -97,34 +97,26 @@ def _plot_against(results: Results, cost: str, name: str, title: str, cost_words
             panels.append(Panel(y_label, higher, tuple(lines), results.input_mean(score, scenes)))
     if not panels:
         return None
-    rows = [
-        (panel.y_label, line.name, point.label, f"{point.x:.4g}", *_format_interval(point.y))
-        for panel in panels
-        for line in panel.lines
-        for point in line.points
-    ]
+    rows = []
+    for panel in panels:
+        for line in panel.lines:
+            for point in line.points:
+                # A mean and the ends of its interval, which are empty if the scenes are too few
+                numbers = [point.y.mean, *([point.y.low, point.y.high] if point.y.count >= MIN_SCENES else [])]
+                words = [f"{value:.5g}" for value in numbers] + [""] * (3 - len(numbers))
+                rows.append((panel.y_label, line.name, point.label, f"{point.x:.4g}", *words))
     head = ("Panel", "Line", "Point", x_label, "Mean", "Low", "High")
-    caption = f"{results.caveat}Quality against {cost_words}. Measured on {PARTS[results.part]}."
-    return Chart(name, title, f"{caption} {_describe_scenes(panels[0])}", x_label, head, tuple(rows), tuple(panels))
-
-
-def _describe_scenes(panel: Panel) -> str:
-    """Describe the scenes and the intervals of a panel for the caption."""
-    scenes = sorted({scene for line in panel.lines for point in line.points for scene in point.by_scene})
+    shown = sorted({scene for line in panels[0].lines for point in line.points for scene in point.by_scene})
     max_named = 8  # most scenes that a caption names
-    listed = f"{', '.join(scenes[:max_named])}{', ...' if len(scenes) > max_named else ''}"
-    if len(scenes) <= 1:
-        return f"Scene: {listed}; one scene has no intervals."
-    return (
-        f"Means over {len(scenes)} scenes ({listed}); bands, from three scenes on: 95 % t intervals of the"
-        " differences between settings, without those between scenes."
-    )
-
-
-def _format_interval(interval: Interval) -> list[str]:
-    """Format a mean and the ends of its interval; the ends are empty if the scenes are too few."""
-    ends = [interval.low, interval.high] if interval.count >= MIN_SCENES else []
-    return [f"{value:.5g}" for value in (interval.mean, *ends)] + [""] * (2 - len(ends))
+    listed = f"{', '.join(shown[:max_named])}{', ...' if len(shown) > max_named else ''}"
+    about = f"Scene: {listed}; one scene has no intervals."
+    if len(shown) > 1:
+        about = (
+            f"Means over {len(shown)} scenes ({listed}); bands, from three scenes on: 95 % t intervals of the"
+            " differences between settings, without those between scenes."
+        )
+    caption = f"{results.caveat}Quality against {cost_words}. Measured on {PARTS[results.part]}. {about}"
+    return Chart(name, title, caption, x_label, head, tuple(rows), tuple(panels))
 
 
 def draw_figures(figures: Sequence[Chart], folder: Path) -> dict[str, bytes]:

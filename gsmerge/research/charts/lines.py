@@ -200,7 +200,13 @@ def make_lines(records: Sequence[RunRecord], x: str, y: str) -> list[Line]:
             measured.setdefault((line_key(record), size_label(record)), {})[record.scene] = float(cost), score
     common = keep_common({point: set(by_scene) for point, by_scene in measured.items()})
     kept = {point: {s: xy for s, xy in measured[point].items() if s in scenes} for point, scenes in common.items()}
-    intervals = _point_intervals(list(kept.values()))
+    columns = list(kept.values())
+    if columns and all(column.keys() == columns[0].keys() for column in columns):
+        values = [[column[scene][1] for column in columns] for scene in sorted(columns[0])]
+        intervals = paired_intervals(np.array(values, np.float64))
+    else:  # points that differ in their scenes cannot be compared, so their intervals have the width 0
+        means = [float(np.mean([y for _, y in column.values()])) for column in columns]
+        intervals = [Interval(mean, mean, mean, len(column)) for mean, column in zip(means, columns, strict=True)]
     points: dict[LineKey, list[Point]] = {}
     for ((key, size), by_scene), interval in zip(kept.items(), intervals, strict=True):
         costs = [cost for cost, _ in by_scene.values()]
@@ -223,15 +229,3 @@ def keep_common(scenes_of: Mapping[K, set[str]]) -> dict[K, set[str]]:
     kept = {point: scenes for point, scenes in scenes_of.items() if len(scenes) >= fewest}
     common = set.intersection(*kept.values()) if kept else set()
     return {point: common or scenes for point, scenes in kept.items()}
-
-
-def _point_intervals(columns: Sequence[ByScene]) -> list[Interval]:
-    """Compute the mean score of each point over its scenes, with a confidence interval for comparing the points.
-
-    The intervals come from :func:`paired_intervals`. If points differ in their scenes, intervals have the width 0.
-    """
-    if columns and all(column.keys() == columns[0].keys() for column in columns):
-        values = [[column[scene][1] for column in columns] for scene in sorted(columns[0])]
-        return paired_intervals(np.array(values, np.float64))
-    means = [float(np.mean([y for _, y in column.values()])) for column in columns]
-    return [Interval(mean, mean, mean, len(column)) for mean, column in zip(means, columns, strict=True)]

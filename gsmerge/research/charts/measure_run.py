@@ -20,7 +20,7 @@ from gsmerge.road import compact
 from gsmerge.scoring.evaluate import INPUT, EvaluateOptions, evaluate
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.special.left_out import choose_left_out
-from gsmerge.types import Gaussians, Scene, Views
+from gsmerge.types import Scene
 
 RUNS = "runs.jsonl"  # in the folder of a grid
 SCORING = ("score", "input")  # stages of a run that only measure
@@ -97,13 +97,24 @@ def run_setting(source: ChartScene, record: RunRecord, options: CompactOptions, 
         result = compact(scene, options)
         gaussians, notes = result.gaussians, (*notes, *result.report.notes)
         seconds = sum(time for name, time in result.report.seconds.items() if name not in SCORING)
+    # Means by name (``psnr_target_visible``, ...); names without a measurement are left out
+    results = {} if record.method == INPUT else {"result": gaussians}
+    evaluation = evaluate(scene, results, held_out, replace(measured, own=record.method == INPUT, fog=False))
+    scores: dict[str, float] = {}
+    max_db = 100.0  # PSNR of equal pictures, since JSON has no infinity
+    for split in evaluation.num_views:
+        full, masked = evaluation.results[-1].mean(split)
+        for part, quality in (("", full), ("_visible", masked)):
+            for name, value in asdict(quality).items():
+                if value is not None and not math.isnan(value):
+                    scores[f"{name}_{split}{part}"] = min(value, max_db)
     return replace(
         record,
         num_input=scene.num_gaussians,
         count=len(gaussians),
         bytes=file_bytes(len(gaussians), gaussians.sh_degree),
         seconds=seconds,
-        scores=mean_scores(scene, None if record.method == INPUT else gaussians, held_out, measured),
+        scores=scores,
         notes=notes,
         held_out=() if held_out is None or source.targets is not None else held_out.names,
     )
@@ -133,23 +144,3 @@ def hold_out(scene: Scene) -> tuple[Scene, HeldOutViews | None]:
     rest = [view for view in range(len(scene)) if view not in ids]
     names = tuple(scene.names[view] for view in ids)
     return subset(scene, rest), HeldOutViews(scene.cameras[ids], scene.images[ids], names, tuple(ids), tuple(rest))
-
-
-def mean_scores(
-    scene: Scene, gaussians: Gaussians | None, targets: Views | None, options: EvaluateOptions
-) -> dict[str, float]:
-    """Measure mean scores by name (``psnr_target_visible``, ...); names without a measurement are left out.
-
-    Without ``gaussians`` the scene's own Gaussians are measured.
-    """
-    results = {} if gaussians is None else {"result": gaussians}
-    evaluation = evaluate(scene, results, targets, replace(options, own=gaussians is None, fog=False))
-    scores: dict[str, float] = {}
-    max_db = 100.0  # PSNR of equal pictures, since JSON has no infinity
-    for split in evaluation.num_views:
-        full, masked = evaluation.results[-1].mean(split)
-        for part, quality in (("", full), ("_visible", masked)):
-            for name, value in asdict(quality).items():
-                if value is not None and not math.isnan(value):
-                    scores[f"{name}_{split}{part}"] = min(value, max_db)
-    return scores

@@ -5,7 +5,7 @@ import shlex
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.batch_command import check_failures
@@ -51,7 +51,9 @@ def chart(
     json: opt.Json = False, progress: opt.Progress = None, quiet: opt.Quiet = False,
 ) -> None:  # fmt: skip
     """Run settings over scenes, and draw charts and a page of all results; a repeated call resumes the runs."""
+    from gsmerge.research.charts.grid import find_sources, make_runs, parse_grid
     from gsmerge.research.charts.measure_run import read_runs
+    from gsmerge.scoring.evaluate import EvaluateOptions
 
     scenes = scenes or []
     if os.path.lexists(output) and not output.is_dir():
@@ -62,7 +64,10 @@ def chart(
     (chart_options,) = given.make(ChartOptions)
     fixed = {name: value for name, value in given.values.items() if name not in flat_settings(ChartOptions)}
     with given.usage_errors():
-        measured, runs, notes = _plan_runs(scenes, output, grid or (), targets, chart_options, fixed)
+        nets, notes = lpips_networks(chart_options.lpips, NETS) if scenes else ((), [])
+        measured = EvaluateOptions(nets, chart_options.lpips_views)
+        sources = find_sources(scenes, output, targets) if scenes else []
+        runs = make_runs(sources, parse_grid(grid or ()), fixed, measured)
     done = {record.key for record in read_runs(output) if record.error is None and not chart_options.rerun}
     pending = [run for run in runs if run[1].key not in done]
     if dry_run:
@@ -78,23 +83,6 @@ def chart(
         call += [word for value in values or () for word in (f"--{name}", value)]
     _draw_results(output, shlex.join(call), notes, len(pending), json=json, quiet=quiet)
     check_failures(failed, len(pending), "run")
-
-
-def _plan_runs(
-    scenes: Sequence[str], out: Path, grid: Sequence[str], targets: str | None, chart_options: ChartOptions,
-    fixed: dict[str, Any],
-) -> "tuple[EvaluateOptions, list[GridRun], list[str]]":  # fmt: skip
-    """Return the options with which results are measured, the runs of the grid, and notes for the user.
-
-    ``fixed`` are settings of compact that hold for all runs.
-    """
-    from gsmerge.research.charts.grid import find_sources, make_runs, parse_grid
-    from gsmerge.scoring.evaluate import EvaluateOptions
-
-    nets, notes = lpips_networks(chart_options.lpips, NETS) if scenes else ((), [])
-    measured = EvaluateOptions(nets, chart_options.lpips_views)
-    sources = find_sources(scenes, out, targets) if scenes else []
-    return measured, make_runs(sources, parse_grid(grid), fixed, measured), list(notes)
 
 
 def _run_all(

@@ -1,6 +1,5 @@
 """``gsmerge lab stress``: test a user's own scene under bad conditions."""
 
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,7 +11,7 @@ from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.setting import Settings, setting
 
 if TYPE_CHECKING:
-    from gsmerge.research.stress import StressOutcome
+    pass
 
 
 @dataclass(frozen=True)
@@ -60,17 +59,14 @@ def stress(
         "failed": sum(outcome.held is False for outcome in outcomes),
         **note_entries(notes),
     }
-    print_document(document, _outcome_lines(outcomes), as_json=json, quiet=quiet)
-    failed = [outcome.case for outcome in outcomes if outcome.held is False]
-    if failed:
-        raise TargetError(f"{len(failed)} of {len(outcomes)} cases failed: {', '.join(failed)}")
-
-
-def _outcome_lines(outcomes: "Sequence[StressOutcome]") -> list[str]:
-    """Return the lines of the summary: one for each case, the properties that failed, and the number that held."""
+    # A line for each case, the properties that failed, and the number that held
     marks = {True: "held", False: "FAILED", None: "-"}
     width = max((len(outcome.words) for outcome in outcomes), default=0)
     lines = [f"{marks[o.held]:<7} {o.words:<{width}}  {o.found}" for o in outcomes]
     lines += [f"        expected of '{o.words}': {o.wanted}" for o in outcomes if o.held is False]
-    tried = [outcome for outcome in outcomes if outcome.held is not None]
-    return [*lines, f"{sum(o.held is True for o in tried)} of {len(tried)} held"]
+    num_tried = sum(outcome.held is not None for outcome in outcomes)
+    lines += [f"{document['held']} of {num_tried} held"]
+    print_document(document, lines, as_json=json, quiet=quiet)
+    failed = [outcome.case for outcome in outcomes if outcome.held is False]
+    if failed:
+        raise TargetError(f"{len(failed)} of {len(outcomes)} cases failed: {', '.join(failed)}")

@@ -151,7 +151,10 @@ def predict_depth(view: TrueView, noise: Noise, rng: np.random.Generator) -> tup
     bled = 1 / (1 / depth + noise.bleed * near_edge * (smooth - 1 / depth))
     amplification = 1 + noise.blank * blank + 3 * is_beyond
     drift = noise.drift * smooth_noise(rng, height, width, int(rng.integers(3, 7)))
-    patch = _wrong_patches(blank, noise, rng)
+    # Patches of wrong depth, 0 to 1, are more likely where the photo is blank
+    field = smooth_noise(rng, height, width, int(rng.integers(5, 12))) + noise.blank * blank
+    limit = np.float32(np.quantile(field.astype(np.float64), 1 - noise.patches))
+    patch = np.clip((field - limit) / 0.3, 0, 1) if noise.patches > 0 else np.zeros_like(field)
     patch_error = patch * noise.patch_error * smooth_noise(rng, height, width, 8)
     grain = noise.grain * rng.normal(0, 1, depth.shape)
     predicted = bled * exp(noise.view_bias * rng.normal() + amplification * (drift + grain) + patch_error)
@@ -162,14 +165,6 @@ def predict_depth(view: TrueView, noise: Noise, rng: np.random.Generator) -> tup
     return predicted.astype(np.float32), np.clip(np.where(floats, 0.5 * trust, trust), 0, 1).astype(np.float32)
 
 
-def _wrong_patches(blank: Float, noise: Noise, rng: np.random.Generator) -> Float:
-    """Draw a mask ``[h,w]`` of patches of wrong depth, 0 to 1; patches are more likely where the photo is ``blank``."""
-    height, width = blank.shape
-    field = smooth_noise(rng, height, width, int(rng.integers(5, 12))) + noise.blank * blank
-    limit = np.float32(np.quantile(field.astype(np.float64), 1 - noise.patches))
-    return np.clip((field - limit) / 0.3, 0, 1) if noise.patches > 0 else np.zeros_like(field)
-
-
 RAISED = 10.0  # base colour at which the effect of shN is measured, so high that no colour is clamped at 0
 
 
@@ -178,23 +173,6 @@ def quats_facing(normals: Array) -> Array:
     z = normals * np.where(normals[:, 2:] < 0, -1, 1)
     quats = np.stack([1 + z[:, 2], -z[:, 1], z[:, 0], np.zeros(len(z))], 1)
     return quats / np.linalg.norm(quats, axis=1, keepdims=True)
-
-
-def _harmonics(colors: Float, means: Float, eye: Array, noise: Noise, rng: np.random.Generator) -> tuple[Float, Float]:
-    """Draw random shN ``[n,k-1,3]``, and compute sh0 ``[n,1,3]`` so that Gaussians have ``colors`` seen from ``eye``.
-
-    Returns sh0 and shN. The effect of shN is rendered at the colour ``RAISED``, and subtracted from sh0.
-    """
-    n, num_rest = len(colors), (noise.sh_degree + 1) ** 2 - 1
-    sh0 = ((colors - 0.5) / SH_C0)[:, None].astype(np.float32)
-    common = rng.normal(0, 1, (1, num_rest, 3))  # equal for all Gaussians, since highlights of a view are on one side
-    shN = (noise.harmonics * (0.7 * common + 0.7 * rng.normal(0, 1, (n, num_rest, 3)))).astype(np.float32)
-    if num_rest:
-        raised = np.full_like(sh0, RAISED / SH_C0)
-        rendered = np.empty((n, 3), np.float32)
-        view_colors(means, raised, shN, np.arange(n, dtype=np.int32), eye.astype(np.float32), 0, n, rendered)
-        sh0 -= ((rendered - (RAISED + 0.5)) / SH_C0)[:, None]
-    return sh0, shN
 
 
 def pixel_gaussians(view: TrueView, lens: Pinhole, noise: Noise, rng: np.random.Generator) -> Gaussians:
@@ -208,22 +186,24 @@ def pixel_gaussians(view: TrueView, lens: Pinhole, noise: Noise, rng: np.random.
     normals = view.normals.reshape(-1, 3) + rng.normal(0, noise.tilt, (n, 3))
     normals = np.where(np.linalg.norm(normals, axis=1, keepdims=True) < 1e-6, rays, normals)
     quats = quats_facing(normals / np.linalg.norm(normals, axis=1, keepdims=True))
-    scales = _pixel_scales(depth / lens.focal, noise, rng)
+    shape = np.array([1.0, 1.0, noise.flatness]) * exp(rng.normal(0, noise.scale_jitter, (n, 3)))
+    scales = noise.scale * (depth / lens.focal)[:, None] * shape
+    is_oversized = rng.random(n) < noise.oversized
+    scales[is_oversized] *= rng.uniform(2, max(2.0, noise.oversize), (int(is_oversized.sum()), 1))
     opacities = noise.opacity_low + (noise.opacity_high - noise.opacity_low) * confidence
     opacities = np.clip(opacities + rng.normal(0, noise.opacity_grain, n), 0.01, 0.995)
     min_blur = 0.2  # least standard deviation of the smoothing of colours, pixels; smaller values change nothing
     image = blur(view.image, noise.color_blur) if noise.color_blur > min_blur else view.image
     colors = np.clip(image.reshape(-1, 3) + rng.normal(0, noise.color_grain, (n, 3)), 0, 1).astype(np.float32)
-    sh0, shN = _harmonics(colors, means, view.c2w[:3, 3], noise, rng)
+    # Higher harmonics are random. Their effect is rendered at the colour RAISED, and subtracted from sh0, so that
+    # Gaussians have the colours of the picture seen from its camera
+    sh0, num_rest = ((colors - 0.5) / SH_C0)[:, None].astype(np.float32), (noise.sh_degree + 1) ** 2 - 1
+    common = rng.normal(0, 1, (1, num_rest, 3))  # equal for all Gaussians, since highlights of a view are on one side
+    shN = (noise.harmonics * (0.7 * common + 0.7 * rng.normal(0, 1, (n, num_rest, 3)))).astype(np.float32)
+    if num_rest:
+        raised, eye = np.full_like(sh0, RAISED / SH_C0), view.c2w[:3, 3].astype(np.float32)
+        rendered = np.empty((n, 3), np.float32)
+        view_colors(means, raised, shN, np.arange(n, dtype=np.int32), eye, 0, n, rendered)
+        sh0 -= ((rendered - (RAISED + 0.5)) / SH_C0)[:, None]
     columns = (means, quats, scales, opacities, sh0, shN)
     return Gaussians(*(np.ascontiguousarray(column, dtype=np.float32) for column in columns))
-
-
-def _pixel_scales(footprints: Array, noise: Noise, rng: np.random.Generator) -> Array:
-    """Draw scales ``[n,3]`` from the footprints ``[n]`` of pixels; some Gaussians are far too large."""
-    n = len(footprints)
-    shape = np.array([1.0, 1.0, noise.flatness]) * exp(rng.normal(0, noise.scale_jitter, (n, 3)))
-    scales = noise.scale * footprints[:, None] * shape
-    is_oversized = rng.random(n) < noise.oversized
-    scales[is_oversized] *= rng.uniform(2, max(2.0, noise.oversize), (int(is_oversized.sum()), 1))
-    return scales

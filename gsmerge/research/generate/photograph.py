@@ -93,33 +93,27 @@ class LitRoom:
 
 def screen_boxes(shapes: ShapeArrays, c2w: Array, lens: Pinhole, samples: int) -> NDArray[np.int32]:
     """Compute boxes ``[m,4]`` of x0, y0, x1, y1: the samples in which the camera ``c2w`` may see each shape."""
-    points, valid = _clipped_corners(shapes, c2w)
+    half = half_sizes(shapes)
+    signs = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij"), -1).reshape(-1, 3)
+    corners = matmul(half[:, None] * signs, shapes.rotations.swapaxes(1, 2)) + shapes.centres[:, None]
+    local = matmul(corners - c2w[:3, 3], c2w[:3, :3])
+    # Edges that reach behind the camera are cut at the near plane. The numbers of two corners of an edge differ in one
+    # bit
+    edges = np.array([(i, i | bit) for bit in (1, 2, 4) for i in range(8) if not i & bit])
+    a, b = local[:, edges[:, 0]], local[:, edges[:, 1]]
+    near_plane = 1e-3  # metres
+    with np.errstate(divide="ignore", invalid="ignore"):  # edges parallel to the plane are not used
+        crossing = a + (b - a) * ((near_plane - a[..., 2:]) / (b[..., 2:] - a[..., 2:]))
+    crosses = (a[..., 2] < near_plane) != (b[..., 2] < near_plane)
+    # Points ``[m,20,3]`` in the camera's frame: the 8 corners, then the points where the 12 edges cross the near plane.
+    # ``valid [m,20,1]`` is True for corners beyond the plane, and for edges that cross it
+    points = np.concatenate([local, np.where(crosses[..., None], crossing, 0.0)], 1)
+    valid = np.concatenate([local[..., 2] >= near_plane, crosses], 1)[..., None]
     pixels = points[..., :2] / np.where(valid, points[..., 2:], 1) * lens.focal + [lens.width / 2, lens.height / 2]
     limits = np.array([lens.width, lens.height]) * samples
     low = np.where(valid, np.floor(pixels * samples) - 1, np.inf).min(1)
     high = np.where(valid, np.ceil(pixels * samples) + 1, -np.inf).max(1)
     return np.concatenate([np.clip(low, 0, limits), np.clip(high, 0, limits)], 1).astype(np.int32)
-
-
-def _clipped_corners(shapes: ShapeArrays, c2w: Array) -> tuple[Array, Array]:
-    """Clip the bounding boxes of shapes at the near plane of the camera ``c2w [4,4]``.
-
-    Returns points ``[m,20,3]`` in the camera's frame: the 8 corners, then the points where the 12 edges cross the near
-    plane. A mask ``[m,20,1]`` is True for corners beyond the plane, and for edges that cross it.
-    """
-    half = half_sizes(shapes)
-    signs = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij"), -1).reshape(-1, 3)
-    corners = matmul(half[:, None] * signs, shapes.rotations.swapaxes(1, 2)) + shapes.centres[:, None]
-    local = matmul(corners - c2w[:3, 3], c2w[:3, :3])
-    # The numbers of two corners of an edge differ in one bit
-    edges = np.array([(i, i | bit) for bit in (1, 2, 4) for i in range(8) if not i & bit])
-    a, b = local[:, edges[:, 0]], local[:, edges[:, 1]]
-    near_plane = 1e-3  # depth in metres at which edges that reach behind the camera are cut
-    with np.errstate(divide="ignore", invalid="ignore"):  # edges parallel to the plane are not used
-        crossing = a + (b - a) * ((near_plane - a[..., 2:]) / (b[..., 2:] - a[..., 2:]))
-    crosses = (a[..., 2] < near_plane) != (b[..., 2] < near_plane)
-    points = np.concatenate([local, np.where(crosses[..., None], crossing, 0.0)], 1)
-    return points, np.concatenate([local[..., 2] >= near_plane, crosses], 1)[..., None]
 
 
 def trace(shapes: ShapeArrays, c2w: Array, lens: Pinhole, samples: int) -> Hits:
@@ -134,14 +128,6 @@ def trace(shapes: ShapeArrays, c2w: Array, lens: Pinhole, samples: int) -> Hits:
     # Fills the arrays of hits
     cast(eye, axes, intrinsics, 1.0 / samples, *table, boxes, hits.depth, hits.ids, hits.points, hits.normals)
     return hits
-
-
-def _shadow_map_axes(towards: Array) -> Array:
-    """Compute the axes of a shadow map as rows right, down, forward ``[3,3]``; ``towards`` points to the light."""
-    forward = -towards / norm(towards)
-    right = np.cross([0.3, 1.0, 0.2], forward)
-    right /= norm(right)
-    return np.stack([right, np.cross(forward, right), forward])
 
 
 def _shadow_map(shapes: ShapeArrays, axes: Array, middle: Array, radius: float, size: int) -> Float:
@@ -165,8 +151,18 @@ def light_room(room: Room) -> LitRoom:
     middle, radius = (low + high) / 2, norm(high - low) / 2
     rng = np.random.default_rng(0)
     key = [room.light.towards + room.light.softness * rng.normal(0, 0.6, 3) for _ in range(KEY_MAPS)]
-    ambient = _ambient_directions()
-    axes = np.stack([_shadow_map_axes(towards) for towards in (*key, *ambient)])
+    # The directions ``[AMBIENT_MAPS,3]`` of the ambient light, evenly over the sphere (Fibonacci's spiral)
+    steps = np.arange(AMBIENT_MAPS) + 0.5
+    up, azimuth = 1 - 2 * steps / AMBIENT_MAPS, np.pi * (1 + 5**0.5) * steps
+    horizontal = np.sqrt(1 - up**2)
+    ambient = np.stack([horizontal * cos(azimuth), -up, horizontal * sin(azimuth)], 1)
+    all_axes = []  # axes of each shadow map as rows right, down, forward ``[3,3]``
+    for towards in (*key, *ambient):
+        forward = -towards / norm(towards)
+        right = np.cross([0.3, 1.0, 0.2], forward)
+        right /= norm(right)
+        all_axes.append(np.stack([right, np.cross(forward, right), forward]))
+    axes = np.stack(all_axes)
     from_below = 0.5  # brightness of light from below, relative to light from above
     return LitRoom(
         room,
@@ -179,14 +175,6 @@ def light_room(room: Room) -> LitRoom:
         np.stack([_shadow_map(opaque, a, middle, radius, AMBIENT_SIZE) for a in axes[KEY_MAPS:]]),
         np.where(-ambient[:, 1] > 0, 1.0, from_below) * 4 / AMBIENT_MAPS,
     )
-
-
-def _ambient_directions() -> Array:
-    """Spread the directions ``[AMBIENT_MAPS,3]`` of the ambient light evenly over the sphere (Fibonacci's spiral)."""
-    steps = np.arange(AMBIENT_MAPS) + 0.5
-    up, azimuth = 1 - 2 * steps / AMBIENT_MAPS, np.pi * (1 + 5**0.5) * steps
-    horizontal = np.sqrt(1 - up**2)
-    return np.stack([horizontal * cos(azimuth), -up, horizontal * sin(azimuth)], 1)
 
 
 def texture_coordinates(shapes: ShapeArrays, ids: NDArray[np.int32], points: Float) -> tuple[Float, Float]:
@@ -228,23 +216,18 @@ def look_up_colors(lit: LitRoom, ids: NDArray[np.int32], points: Float, spread: 
     mip_ids = textures * num_levels + levels
     order = np.argsort(mip_ids, kind="stable")
     out = np.empty((len(ids), 3), np.float32)
+    remap_width = 4096  # columns of a table for cv2.remap, which takes at most 32767
     starts = np.flatnonzero(np.diff(mip_ids[order], prepend=-1))
     for rows in np.split(order, starts[1:]):  # the samples of one mipmap
         texture = lit.mips[textures[rows[0]]][levels[rows[0]]]
-        out[rows] = _sample_texture(texture, uv[rows])
+        # The texture repeats, is sampled bilinearly, and has a v axis that points down
+        num_rows = -(-len(rows) // remap_width)
+        texels = np.zeros((num_rows * remap_width, 2), np.float32)
+        texels[: len(rows)] = (uv[rows] - np.floor(uv[rows])) * len(texture) - 0.5
+        x, y = np.moveaxis(texels.reshape(num_rows, remap_width, 2), 2, 0)
+        colors = cv2.remap(texture, x.copy(), y.copy(), cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+        out[rows] = colors.reshape(-1, 3)[: len(rows)]
     return out
-
-
-def _sample_texture(texture: Texture, uv: Float) -> Float:
-    """Sample a repeating texture bilinearly at ``uv [n,2]``; return the colours ``[n,3]``. The v axis points down."""
-    size = len(texture)
-    remap_width = 4096  # columns of a table for cv2.remap, which takes at most 32767
-    rows = -(-len(uv) // remap_width)
-    texels = np.zeros((rows * remap_width, 2), np.float32)
-    texels[: len(uv)] = (uv - np.floor(uv)) * size - 0.5
-    x, y = np.moveaxis(texels.reshape(rows, remap_width, 2), 2, 0)
-    colors = cv2.remap(texture, x.copy(), y.copy(), cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
-    return colors.reshape(-1, 3)[: len(uv)]
 
 
 def render_light(lit: LitRoom, c2w: Array, lens: Pinhole, samples: int) -> Float:
@@ -275,9 +258,13 @@ def _reflect(lit: LitRoom, hits: Hits, rows: NDArray[np.int64], c2w: Array, lens
     return _shade(lit, ids, albedo, positions, normals, directions)
 
 
-def _incoming_light(lit: LitRoom, positions: Float, normals: Float) -> tuple[Float, Float]:
-    """Compute the direct and the ambient light ``[n]`` that arrives at ``positions [n,3]``, with shadows."""
-    light, half_side = lit.room.light, lit.radius
+def _shade(lit: LitRoom, ids: NDArray[np.int32], albedo: Float, positions: Float, normals: Float, rays: Float) -> Float:
+    """Compute the linear light ``[n,3]`` that points of shapes ``ids [n]`` reflect or emit towards the camera.
+
+    ``rays`` are unit vectors from the camera to the points.
+    """
+    light, shapes, half_side = lit.room.light, lit.shapes.shapes, lit.radius
+    # The direct and the ambient light ``[n]`` that arrives at the points, with shadows
     direct, indirect = np.zeros((2, len(positions)), np.float32)
     key_texels, ambient_texels = 2.0, 1.2  # texels by which a lit surface may lie behind the shadow map's depth
     key_bias, ambient_bias = key_texels * 2 * half_side / KEY_SIZE, ambient_texels * 2 * half_side / AMBIENT_SIZE
@@ -289,16 +276,6 @@ def _incoming_light(lit: LitRoom, positions: Float, normals: Float) -> tuple[Flo
     lamp_distance = np.linalg.norm(positions - light.lamp.astype(np.float32), axis=1)
     lamp_gain, lamp_falloff = 2.5, 1.5  # brightness of the direct light at the lamp, and its decrease with the distance
     direct *= lamp_gain / (1 + (lamp_distance / norm(light.lamp - lit.room.focus)) ** 2 * lamp_falloff)
-    return direct, indirect
-
-
-def _shade(lit: LitRoom, ids: NDArray[np.int32], albedo: Float, positions: Float, normals: Float, rays: Float) -> Float:
-    """Compute the linear light ``[n,3]`` that points of shapes ``ids [n]`` reflect or emit towards the camera.
-
-    ``rays`` are unit vectors from the camera to the points.
-    """
-    light, shapes = lit.room.light, lit.shapes.shapes
-    direct, indirect = _incoming_light(lit, positions, normals)
     gloss = np.array([s.material.gloss for s in shapes], np.float32)[ids]
     halfway = light.towards.astype(np.float32) - rays  # between light and camera (Blinn 1977)
     halfway /= np.linalg.norm(halfway, axis=1, keepdims=True)

@@ -140,18 +140,34 @@ class _PhotoSession:
         return pose
 
     def take_photo(self, place: int, seed: int) -> Float:
-        """Take the photo ``[h,w,3]`` of a place on the path."""
-        return _take_photo(self.lit, self.poses[place], self.photo_lens, self.noise, self.gain, seed)
+        """Take the photo ``[h,w,3]`` of a place on the path, with the errors of lens and sensor."""
+        rng, lens, noise = np.random.default_rng(seed), self.photo_lens, self.noise
+        linear = render_light(self.lit, self.poses[place], lens, SAMPLE_RAYS)
+        gains = self.gain * exp(noise.exposure * rng.normal() + noise.tint * rng.normal(0, 1, 3))
+        y, x = np.mgrid[: lens.height, : lens.width] + 0.5
+        square_radius = ((x - lens.width / 2) ** 2 + (y - lens.height / 2) ** 2) / (lens.width**2 + lens.height**2)
+        vignette = 0.3  # share of light lost at one diagonal from the middle; it grows with the squared distance
+        linear = linear * gains.astype(np.float32) * (1 - vignette * square_radius)[..., None].astype(np.float32)
+        image = blur(tone_map(linear), noise.blur)
+        sensor_noise = 0.004  # standard deviation of the noise of a photo, sRGB
+        image = np.clip(image + rng.normal(0, sensor_noise, image.shape), 0, 1).astype(np.float32)
+        return np.round(image * 255) / np.float32(255)
 
     def predict(self, place: int, photo: Float, deviation: Array, seed: int) -> tuple[Array, Gaussians]:
         """Simulate the network for the photo of a place on the path.
 
         Return the pose and the Gaussians that the network would estimate.
-        ``deviation [2,3]`` is the random error of the pose, see :func:`_perturb_pose`.
+        ``deviation [2,3]`` has standard normal numbers for the errors of rotation and position, which are multiplied by
+        the sizes of these errors, ``noise.turn`` and ``noise.shift``.
         """
         hits = trace(self.lit.shapes, self.poses[place], self.lens, 1)
         depth = np.minimum(hits.depth, NO_SURFACE_DEPTH) * self.noise.unit
-        pose = _perturb_pose(self.exported_pose(place), self.noise, float(np.median(depth)), deviation)
+        pose = self.exported_pose(place)
+        rotation = np.deg2rad(self.noise.turn) * deviation[0] / 3**0.5
+        angle = np.sqrt((rotation * rotation).sum())
+        quat = np.array([cos(angle / 2), *(sin(angle / 2) / max(angle, 1e-12) * rotation)])
+        pose[:3, :3] = matmul(pose[:3, :3], quat_to_rotmat(quat))
+        pose[:3, 3] += self.noise.shift * float(np.median(depth)) * deviation[1] / 3**0.5
         normals = matmul(hits.normals, self.to_export[:3, :3].T).astype(np.float32)
         size = self.lens.width, self.lens.height
         image = photo if self.photo_lens == self.lens else cv2.resize(photo, size, interpolation=cv2.INTER_AREA)
@@ -225,36 +241,6 @@ def _find_room(rng: np.random.Generator, lens: Pinhole, num_views: int) -> tuple
             if all(is_usable(trace(lit.shapes, pose, _shrink_lens(lens), 1)) for pose in poses):
                 return lit, path
     return lit, path
-
-
-def _take_photo(lit: LitRoom, pose: Array, lens: Pinhole, noise: Noise, gain: float, seed: int) -> Float:
-    """Render the photo ``[h,w,3]`` of a pose, with the errors of lens and sensor, and with the exposure ``gain``."""
-    rng = np.random.default_rng(seed)
-    linear = render_light(lit, pose, lens, SAMPLE_RAYS)
-    gains = gain * exp(noise.exposure * rng.normal() + noise.tint * rng.normal(0, 1, 3))
-    y, x = np.mgrid[: lens.height, : lens.width] + 0.5
-    square_radius = ((x - lens.width / 2) ** 2 + (y - lens.height / 2) ** 2) / (lens.width**2 + lens.height**2)
-    vignette = 0.3  # share of light lost at one diagonal from the middle; it grows with the squared distance
-    linear = linear * gains.astype(np.float32) * (1 - vignette * square_radius)[..., None].astype(np.float32)
-    image = blur(tone_map(linear), noise.blur)
-    sensor_noise = 0.004  # standard deviation of the noise of a photo, sRGB
-    image = np.clip(image + rng.normal(0, sensor_noise, image.shape), 0, 1).astype(np.float32)
-    return np.round(image * 255) / np.float32(255)
-
-
-def _perturb_pose(pose: Array, noise: Noise, depth: float, deviation: Array) -> Array:
-    """Add the network's error to a pose, for a median ``depth``.
-
-    ``deviation [2,3]`` has standard normal numbers for rotation and position. These numbers are multiplied by
-    ``noise.turn`` and ``noise.shift``, the sizes of the errors.
-    """
-    rotation = np.deg2rad(noise.turn) * deviation[0] / 3**0.5
-    angle = np.sqrt((rotation * rotation).sum())
-    quat = np.array([cos(angle / 2), *(sin(angle / 2) / max(angle, 1e-12) * rotation)])
-    out = pose.copy()
-    out[:3, :3] = matmul(pose[:3, :3], quat_to_rotmat(quat))
-    out[:3, 3] += noise.shift * depth * deviation[1] / 3**0.5
-    return out
 
 
 def _to_cameras(poses: Sequence[Array], lens: Pinhole) -> Cameras:

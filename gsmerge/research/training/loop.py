@@ -38,8 +38,6 @@ from gsmerge.runtime.threads import parallel_map, use_threads
 
 VALIDATION = 2**32  # replaces the step in the seed of the random numbers of validation
 LossRow = dict[str, float]  # a row of the table of losses, by column
-# For each window: PSNR (dB) without and with networks, and share of merged Feature Gaussians
-Scores = list[tuple[float, float, float]]
 OnTrainingStep = Callable[[int, int, float], None]  # called with step, number of steps, loss
 RUN_FORMAT = "gsmerge-training"
 RUN_REMEDY = "choose another --output, or remove it to start again"
@@ -47,21 +45,6 @@ RUN_REMEDY = "choose another --output, or remove it to start again"
 
 def validate(networks: Networks, shards: Sequence[Shard], options: TrainOptions) -> LossRow:
     """Measure the mean PSNR (dB) of windows without and with networks, and the share of merged Feature Gaussians."""
-    scores = [window for i, shard in enumerate(shards) for window in _score_shard(networks, shard, i, options)]
-    analytic, learned, matched = np.mean(scores, 0).tolist()
-    return {"psnr_analytic": analytic, "psnr_learned": learned, "matched": matched}
-
-
-def _score_shard(networks: Networks, shard: Shard, number: int, options: TrainOptions) -> Scores:
-    """Score random windows of a shard. A shard of the same ``number`` gets the same windows every time."""
-    rng = np.random.default_rng([options.seed, VALIDATION, number])
-    example = read_shard(shard)
-    windows = [
-        sample_window(
-            draw_random_views(example, options, rng), options.levels, options.window, options.most, novel=1, rng=rng
-        )
-        for _ in range(options.validation_windows)
-    ]
 
     def score_window(window: Window) -> tuple[float, float, float]:
         """Return the PSNR (dB) without and with networks, and the share of merged Feature Gaussians."""
@@ -69,7 +52,16 @@ def _score_shard(networks: Networks, shard: Shard, number: int, options: TrainOp
         image, matched = render_window(window, networks, options)
         return window_psnr(window, plain), window_psnr(window, image), matched
 
-    return parallel_map(score_window, windows)
+    scores = list[tuple[float, float, float]]()
+    for number, shard in enumerate(shards):
+        rng = np.random.default_rng([options.seed, VALIDATION, number])  # a shard gets the same windows every time
+        example, windows = read_shard(shard), list[Window]()
+        for _ in range(options.validation_windows):
+            part = draw_random_views(example, options, rng)
+            windows.append(sample_window(part, options.levels, options.window, options.most, novel=1, rng=rng))
+        scores += parallel_map(score_window, windows)
+    analytic, learned, matched = np.mean(scores, 0).tolist()
+    return {"psnr_analytic": analytic, "psnr_learned": learned, "matched": matched}
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,37 +121,35 @@ def train(
         raise ValueError("examples: expected at least one, got none")
     options.require_weights()
     out.mkdir(parents=True, exist_ok=True)
-    validators = validation or shards
+    validators: Sequence[Shard] = validation or shards
     ids = even_views(len(validators), min(len(validators), options.validation_examples))
-    with use_threads(threads):
-        return _train(options, shards, [validators[i] for i in ids], out, progress)
-
-
-def _train(
-    options: TrainOptions, shards: Sequence[Shard], validation: Sequence[Shard], out: Path, progress: OnTrainingStep
-) -> TrainResult:
-    """Make or load the networks, and train them to the last step; see :func:`train`."""
-    with torch.random.fork_rng(devices=[]):  # new networks depend only on the seed
-        torch.manual_seed(options.seed)
-        networks = Networks(options.network)
-    optimizer = torch.optim.AdamW(networks.parameters(), lr=options.rate, weight_decay=options.decay)
-    state = TrainingState(networks, deepcopy(networks).requires_grad_(False), optimizer)
-    losses = list[Tensor]()
-    hashes = {kind: [shard.sha256 for shard in part] for kind, part in (("data", shards), ("validation", validation))}
+    validators = [validators[i] for i in ids]
+    hashes = {kind: [shard.sha256 for shard in part] for kind, part in (("data", shards), ("validation", validators))}
     facts = {"options": options.to_dict(), **hashes}
-    step, rows = _load_run(out, state, facts)
-    resumed = step
-    read = lru_cache(options.buffer)(read_shard)
-    while step < options.steps:
-        losses.append(_take_step(state, shards, read, options, step))
-        step += 1
-        progress(step, options.steps, float(losses[-1]))
-        if step % options.save_every == 0 or step == options.steps:
-            scores = validate(state.smooth, validation, options)
-            mean = float(torch.stack(losses).mean())
-            rows.append({"step": step, "rate": options.rate_at(step - 1), "loss": mean, **scores})
-            losses = []
-            _save_run(out, state, rows, facts, options)
+    with use_threads(threads):
+        with torch.random.fork_rng(devices=[]):  # new networks depend only on the seed
+            torch.manual_seed(options.seed)
+            networks = Networks(options.network)
+        optimizer = torch.optim.AdamW(networks.parameters(), lr=options.rate, weight_decay=options.decay)
+        state = TrainingState(networks, deepcopy(networks).requires_grad_(False), optimizer)
+        step, rows, path = 0, list[LossRow](), out / "state.safetensors"
+        if path.exists():
+            stored = load_training(path, state)
+            for name, value in facts.items():
+                if stored.get(name) != value:
+                    raise SceneError(path, f"expected a run with the same {name}, found another", RUN_REMEDY)
+            step, rows = int(stored["step"]), list(stored["rows"])
+        resumed, losses, read = step, list[Tensor](), lru_cache(options.buffer)(read_shard)
+        while step < options.steps:
+            losses.append(_take_step(state, shards, read, options, step))
+            step += 1
+            progress(step, options.steps, float(losses[-1]))
+            if step % options.save_every == 0 or step == options.steps:
+                scores = validate(state.smooth, validators, options)
+                mean = float(torch.stack(losses).mean())
+                rows.append({"step": step, "rate": options.rate_at(step - 1), "loss": mean, **scores})
+                losses = []
+                _save_run(out, state, rows, facts, options)
     paths = (out / "best.safetensors", out / "last.safetensors", out / "losses.csv")
     best_psnr = max(row["psnr_learned"] for row in rows)
     return TrainResult(*paths, step, rows[-1]["loss"], rows[-1]["psnr_analytic"], best_psnr, resumed)
@@ -186,22 +176,15 @@ def _save_run(
     lines = [",".join(rows[0]), *(",".join(f"{value:.8g}" for value in row.values()) for row in rows)]
     with atomic_output(out / "losses.csv", overwrite=True) as temporary:
         temporary.write_bytes("\n".join([*lines, ""]).encode())
-    save_training(out / "state.safetensors", state, {"step": rows[-1]["step"], "rows": rows, **facts})
-
-
-def _load_run(out: Path, state: TrainingState, expected: dict[str, Any]) -> tuple[int, list[LossRow]]:
-    """Load the run in the folder into ``state``; return its step, and the rows of its table of losses.
-
-    Without a run, the step is 0 and there are no rows. Raises SceneError if a fact of the run is not as ``expected``.
-    """
-    path = out / "state.safetensors"
-    if not path.exists():
-        return 0, []
-    facts = load_training(path, state)
-    for name, value in expected.items():
-        if facts.get(name) != value:
-            raise SceneError(path, f"expected a run with the same {name}, found another", RUN_REMEDY)
-    return int(facts["step"]), list(facts["rows"])
+    # The state has weights, running means and moments, so that the run can be resumed
+    tensors: dict[str, torch.Tensor] = {}
+    for name, parameter, mean in state.pairs():
+        moments = state.optimizer.state[parameter]
+        named = {"weight": parameter, "mean": mean, "first": moments["exp_avg"], "second": moments["exp_avg_sq"]}
+        tensors |= {f"{kind}.{name}": tensor.detach() for kind, tensor in named.items()}
+    content = save(tensors, {RUN_FORMAT: json.dumps({"step": rows[-1]["step"], "rows": rows, **facts})})
+    with atomic_output(out / "state.safetensors", overwrite=True) as temporary:
+        temporary.write_bytes(content)
 
 
 def _take_step(
@@ -242,19 +225,8 @@ def _take_step(
     return loss[0]
 
 
-def save_training(path: Path, state: TrainingState, facts: Mapping[str, Any]) -> None:
-    """Write weights, running means, moments and ``facts`` about the run to a file, which is replaced."""
-    tensors: dict[str, torch.Tensor] = {}
-    for name, parameter, mean in state.pairs():
-        moments = state.optimizer.state[parameter]
-        named = {"weight": parameter, "mean": mean, "first": moments["exp_avg"], "second": moments["exp_avg_sq"]}
-        tensors |= {f"{kind}.{name}": tensor.detach() for kind, tensor in named.items()}
-    with atomic_output(path, overwrite=True) as temporary:
-        temporary.write_bytes(save(tensors, {RUN_FORMAT: json.dumps(dict(facts))}))
-
-
 def load_training(path: Path, state: TrainingState) -> dict[str, Any]:
-    """Read a file of :func:`save_training` into ``state``; return the facts about the run.
+    """Read the state that :func:`_save_run` wrote into ``state``; return the facts about the run.
 
     Raises SceneError if the file is damaged or has other networks.
     """

@@ -19,10 +19,10 @@ from torch import Tensor
 from torch.nn import functional
 
 from gsmerge.geometry.pooling import Members, pool_members, to_gaussians
+from gsmerge.kernels.raster.step import C1, C2, WINDOW_SIDE
 from gsmerge.networks.tensors import gaussian_sizes, quat_to_rotmat, skew_vectors
 from gsmerge.raster.autograd import render_tensors
 from gsmerge.raster.photos import NEAR_PLANE
-from gsmerge.research.training.loss_ssim import loss_ssim
 from gsmerge.research.training.modules import Networks
 from gsmerge.research.training.predict import Prediction, analytic_gaussians, decode_crop, predict, refine_crop
 from gsmerge.research.training.train_options import TrainOptions
@@ -84,10 +84,17 @@ def window_loss(
     crop, background = window.crop, rng.random(3, dtype=np.float32)
     levels = options.levels if options.joint else (crop.k,)
     teacher, diversity = options.regularizer_weights(step)
+    photo, mask, lpips_weight = window.image, window.mask, options.lpips_weight_at(step)
     refined, total = refine_crop(crop, networks, options, step), torch.zeros(())
     for k in levels:
         prediction = decode_crop(refined, crop, k)
-        loss = photometric_loss(draw_window(prediction.gaussians, window, background), window, options, step)
+        # The loss of a render: difference of colours, 1 - SSIM, and LPIPS in the steps that use it
+        image = draw_window(prediction.gaussians, window, background)
+        color = color_loss(image, photo, mask, options.photo_loss)
+        similar = masked_ssim(image, photo, mask) if options.ssim_weight else torch.ones(())
+        loss = options.photo_weight * color + options.ssim_weight * (1 - similar)
+        if lpips_weight:
+            loss = loss + lpips_weight * lpips_loss(image, photo, mask)
         if diversity and k > 1:
             sibling_loss = diversity_loss(prediction.gaussians, prediction.parents, prediction.sizes)
             loss = loss + diversity * float(loss.detach()) * sibling_loss
@@ -110,6 +117,22 @@ def color_loss(image: Tensor, photo: Tensor, mask: Tensor, kind: str) -> Tensor:
     return (difference * mask[..., None]).sum() / (3 * mask.sum()).clamp_min(1)
 
 
+def loss_ssim(image: Tensor, photo: Tensor) -> Tensor:
+    """Compute the structural similarity ``[h,w,3]`` of image and photo around every pixel, differentiable by torch.
+
+    Windows are uniform, which makes the gradient quick, and have ``WINDOW_SIDE`` pixels per side. Pixels beyond the
+    border are zero. Covariances are sums divided by the number of pixels. The constants of SSIM are K1 = .01 and
+    K2 = .03. The full fit has the same formula, and takes its loss and gradient from
+    ``gsmerge.kernels.raster.step``. The SSIM of reports, :func:`gsmerge.raster.metrics.ssim`, has Gaussian
+    windows, so its values differ.
+    """
+    stacked = torch.stack([image, photo, image * image, photo * photo, image * photo]).permute(0, 3, 1, 2)
+    mx, my, xx, yy, xy = functional.avg_pool2d(stacked, WINDOW_SIDE, 1, WINDOW_SIDE // 2).permute(0, 2, 3, 1)
+    c1, c2 = float(C1), float(C2)
+    numerator = (2 * mx * my + c1) * (2 * (xy - mx * my) + c2)
+    return numerator / ((mx * mx + my * my + c1) * (xx - mx * mx + yy - my * my + c2))
+
+
 def masked_ssim(image: Tensor, photo: Tensor, mask: Tensor) -> Tensor:
     """Average :func:`loss_ssim` of image and photo ``[h,w,3]`` over the pixels of ``mask [h,w]``.
 
@@ -118,16 +141,6 @@ def masked_ssim(image: Tensor, photo: Tensor, mask: Tensor) -> Tensor:
     if not bool(mask.any()):
         return torch.ones(())
     return (loss_ssim(image, photo).mean(-1) * mask).sum() / mask.sum()
-
-
-def photometric_loss(image: Tensor, window: Window, options: TrainOptions, step: int) -> Tensor:
-    """Add up the weighted losses of a render: difference of colours, 1 - SSIM, and LPIPS in the steps that use it."""
-    photo, mask = window.image, window.mask
-    color = color_loss(image, photo, mask, options.photo_loss)
-    similar = masked_ssim(image, photo, mask) if options.ssim_weight else torch.ones(())
-    loss = options.photo_weight * color + options.ssim_weight * (1 - similar)
-    weight = options.lpips_weight_at(step)
-    return loss + weight * lpips_loss(image, photo, mask) if weight else loss
 
 
 def render_window(window: Window, networks: Networks | None, options: TrainOptions) -> tuple[Tensor, float]:
@@ -167,7 +180,15 @@ def teacher_loss(prediction: Prediction, members: Members) -> Tensor:
     moments = pool_members(members, merged.starts, merged.members, "paper")
     teacher = to_gaussians(moments.covars, moments.extinctions, moments.means, moments.sh).to("cpu")[prediction.parents]
     scales, quats = teacher.scales, teacher.quats
-    orders = nearest_axes(quats, g.quats)
+    # A Gaussian does not change if its rotation is multiplied by one of the 24 signed permutations of axes, and its
+    # scales are permuted alike. ``orders [n,3,3]`` are those with which the teacher is nearest to the prediction
+    signed = torch.stack([torch.diag(torch.tensor(signs)) for signs in product((1.0, -1.0), repeat=3)])
+    unsigned = torch.stack([torch.eye(3)[list(order)] for order in permutations(range(3))])
+    proper = (signed[:, None] @ unsigned).reshape(-1, 3, 3)
+    proper = proper[torch.linalg.det(proper) > 0]  # [24,3,3]
+    with torch.no_grad():
+        between = quat_to_rotmat(g.quats).transpose(1, 2) @ quat_to_rotmat(quats)
+        orders = proper[torch.einsum("nij,pji->np", between, proper).argmax(1)]
     scales = (scales[:, None] @ orders.abs())[:, 0]
     rotations = quat_to_rotmat(g.quats).transpose(1, 2) @ quat_to_rotmat(quats) @ orders
     cosines = (rotations.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2
@@ -181,21 +202,6 @@ def teacher_loss(prediction: Prediction, members: Members) -> Tensor:
     return torch.stack([part.mean() for part in parts]).sum()
 
 
-def nearest_axes(quats: Tensor, reference: Tensor) -> Tensor:
-    """Return the signed permutations ``[n,3,3]`` of axes with which ``quats [n,4]`` are nearest to ``reference [n,4]``.
-
-    A Gaussian does not change if its rotation is multiplied by one of these 24 permutations, and its scales are
-    permuted alike.
-    """
-    signed = torch.stack([torch.diag(torch.tensor(signs)) for signs in product((1.0, -1.0), repeat=3)])
-    orders = torch.stack([torch.eye(3)[list(order)] for order in permutations(range(3))])
-    proper = (signed[:, None] @ orders).reshape(-1, 3, 3)
-    proper = proper[torch.linalg.det(proper) > 0]  # [24,3,3]
-    with torch.no_grad():
-        between = quat_to_rotmat(reference).transpose(1, 2) @ quat_to_rotmat(quats)
-        return proper[torch.einsum("nij,pji->np", between, proper).argmax(1)]
-
-
 GEOMETRY_WEIGHT, OPACITY_WEIGHT = 0.75, 0.25  # weights of the two terms of diversity_loss
 
 
@@ -207,7 +213,14 @@ def diversity_loss(gaussians: Gaussians, parents: Tensor, sizes: Tensor) -> Tens
     gradient, since a gradient would make siblings small. With volumes in world units, as in the paper, the loss of a
     million small Gaussians would be almost 0.
     """
-    left, right = sibling_pairs(parents)
+    # Pairs of rows with the same parent, the lower row first. Parents are ascending, so siblings are next to each
+    # other, and pairs are found by the gap between their rows
+    count = int(torch.bincount(parents).max()) if len(parents) else 0
+    rows = torch.arange(len(parents))
+    firsts = [rows[: len(rows) - gap][parents[: len(rows) - gap] == parents[gap:]] for gap in range(1, count)]
+    gaps = [torch.full_like(first, gap) for gap, first in enumerate(firsts, 1)]
+    left = torch.cat([rows[:0], *firsts])
+    right = left + torch.cat([rows[:0], *gaps])
     if len(left) == 0:
         return gaussians.means.new_zeros(())
     volumes = (gaussians.scales.detach() / sizes.detach()[:, None]).prod(1)
@@ -215,20 +228,6 @@ def diversity_loss(gaussians: Gaussians, parents: Tensor, sizes: Tensor) -> Tens
     overlap_loss = overlap_profile(gaussians, left, right)
     opacity_loss = (gaussians.opacities[left] - gaussians.opacities[right]).square()
     return (weights * (GEOMETRY_WEIGHT * overlap_loss + OPACITY_WEIGHT * opacity_loss)).sum() / weights.sum()
-
-
-def sibling_pairs(parents: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the rows of both children of all pairs with the same parent; the first row is the lower one.
-
-    ``parents`` are ascending, so siblings are next to each other. Pairs are found by the gap between their rows.
-    """
-    count = int(torch.bincount(parents).max()) if len(parents) else 0
-    rows = torch.arange(len(parents))
-    firsts = [rows[: len(rows) - gap][parents[: len(rows) - gap] == parents[gap:]] for gap in range(1, count)]
-    gaps = [torch.full_like(first, gap) for gap, first in enumerate(firsts, 1)]
-    empty = rows[:0]
-    left = torch.cat([empty, *firsts])
-    return left, left + torch.cat([empty, *gaps])
 
 
 def overlap_profile(gaussians: Gaussians, left: Tensor, right: Tensor) -> Tensor:

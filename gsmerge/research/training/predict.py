@@ -101,7 +101,17 @@ def differentiate_groups(features: FeatureGaussians, inputs: GroupFeatures, view
     ``inputs`` are the arrays that the kernels made: views, footprints and statistics are taken from them.
     """
     group_viewmats = torch.from_numpy(viewmats[inputs.views]).float()
-    base, frames = differentiate_base(features), _differentiate_frames(features.means, group_viewmats, inputs.frames)
+    base, frames = differentiate_base(features), torch.from_numpy(inputs.frames)
+    if features.means.requires_grad:
+        # A frame depends on the group's mean and on its view. It has no gradient if the ray to the mean is parallel to
+        # the image's right axis
+        centres = -rotate_vectors(group_viewmats[:, :3, :3].transpose(1, 2), group_viewmats[:, :3, 3])
+        away = normalize(features.means - centres, dim=1)
+        across = group_viewmats[:, 0, :3] - (group_viewmats[:, 0, :3] * away).sum(1, keepdim=True) * away
+        right = normalize(across, dim=1)
+        computed = torch.stack([right, torch.linalg.cross(away, right), away], 2)
+        is_stable = (across.norm(dim=1) > 1e-3)[:, None, None]
+        frames = torch.where(is_stable, frames + computed - computed.detach(), frames)  # adds zero, with a gradient
     sizes = gaussian_sizes(base.scales).clamp_min(TINY)
     pixels = torch.from_numpy(inputs.footprints).clamp_min(TINY)
     covars = frames.transpose(1, 2) @ features.covars @ frames / sizes.square()[:, None, None]
@@ -118,24 +128,6 @@ def differentiate_groups(features: FeatureGaussians, inputs: GroupFeatures, view
     ]
     group = torch.cat([torch.cat(numbers, 1).nan_to_num(), torch.from_numpy(inputs.group[:, -NUM_STATS:])], 1)
     return replace(inputs, features=features, base=base, frames=frames, sizes=sizes, group=group)
-
-
-def _differentiate_frames(means: Tensor, viewmats: Tensor, frame_arrays: np.ndarray) -> Tensor:
-    """Convert the frames ``[g,3,3]`` of groups to tensors with a gradient.
-
-    A frame depends on the group's mean and on its view, ``viewmats [g,4,4]``. A frame has no gradient if the ray to the
-    mean is parallel to the image's right axis.
-    """
-    frames = torch.from_numpy(frame_arrays)
-    if not means.requires_grad:
-        return frames
-    centres = -rotate_vectors(viewmats[:, :3, :3].transpose(1, 2), viewmats[:, :3, 3])
-    away = normalize(means - centres, dim=1)
-    across = viewmats[:, 0, :3] - (viewmats[:, 0, :3] * away).sum(1, keepdim=True) * away
-    right = normalize(across, dim=1)
-    computed = torch.stack([right, torch.linalg.cross(away, right), away], 2)
-    is_stable = (across.norm(dim=1) > 1e-3)[:, None, None]
-    return torch.where(is_stable, frames + computed - computed.detach(), frames)  # adds zero, with a gradient
 
 
 def differentiate_tokens(
@@ -182,38 +174,6 @@ def _log_ratio(values: Tensor, units: Tensor) -> Tensor:
     return (torch.log(values.clamp_min(1e-30)) - torch.log(units)).clamp(-30, 30) / 10
 
 
-def move_feature_tensors(group_features: GroupFeatures, residuals: Tensor) -> FeatureGaussians:
-    """Apply corrections ``residuals [g,14]`` to Feature Gaussians, as tensors with a gradient.
-
-    The corrections are those of :func:`gsmerge.networks.corrections.move_features`.
-    """
-    g, f = group_features, group_features.features
-    rotations = _rotations(rotate_vectors(g.frames, residuals[:, ROTATION_COLUMNS]))
-    axes, log_stretches = quat_to_rotmat(g.base.quats), residuals[:, SIZE_COLUMNS]
-    stretches = torch.eye(3) + (axes * torch.expm1(log_stretches)[:, None]) @ axes.transpose(1, 2)
-    changes = rotations @ stretches
-    covars = changes @ f.covars @ changes.transpose(1, 2)
-    log_areas = log_stretches[:, 1] + log_stretches[:, 2]  # change of the area of the two largest scales
-    return replace(
-        f,
-        means=f.means + rotate_vectors(g.frames, residuals[:, MEAN_COLUMNS] * gaussian_sizes(g.base.scales)[:, None]),
-        covars=(covars + covars.transpose(1, 2)) / 2,
-        masses=f.masses
-        * torch.exp(residuals[:, LOGIT_COLUMN] + log_stretches[:, 0] + log_areas + residuals[:, MASS_COLUMN]),
-        extinctions=f.extinctions * torch.exp(residuals[:, LOGIT_COLUMN] + log_areas),
-        sh0=f.sh0 + residuals[:, None, COLOR_COLUMNS] / SH_C0,
-    )
-
-
-def _rotations(vectors: Tensor) -> Tensor:
-    """Compute the rotations ``[n,3,3]`` of rotation vectors ``[n,3]`` (Rodrigues), also differentiable at zero."""
-    x, y, z = vectors.unbind(1)
-    zero = torch.zeros_like(x)
-    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], 1).reshape(-1, 3, 3)
-    angles = (vectors.square().sum(1) + 1e-12).sqrt()[:, None, None]
-    return torch.eye(3) + torch.sin(angles) / angles * cross + (1 - torch.cos(angles)) / angles**2 * cross @ cross
-
-
 def pool_tensors(features: FeatureGaussians, order: np.ndarray, cuts: np.ndarray) -> FeatureGaussians:
     """Pool each cluster of Feature Gaussians into one, as tensors with a gradient.
 
@@ -241,24 +201,6 @@ def pool_tensors(features: FeatureGaussians, order: np.ndarray, cuts: np.ndarray
     return replace(pooled, **columns, latents=average(features.latents[order]))
 
 
-def make_round_tensors(parents: np.ndarray, group_features: GroupFeatures, children: Gaussians) -> Gaussians:
-    """Convert round Gaussians from :func:`gsmerge.networks.apply.prepare_children` to tensors with a gradient.
-
-    Heads whose outputs are "absolute" make children by correcting round Gaussians. ``parents [n]`` are the groups of
-    the round Gaussians.
-    """
-    parent_ids, base, tensors = torch.from_numpy(parents), group_features.base, children.to("cpu")
-    frames = group_features.frames[parent_ids]
-    rotations = (frames - frames.detach()) @ frames.detach().transpose(1, 2)  # zero, with a gradient
-    return replace(
-        tensors,
-        means=base.means[parent_ids],
-        quats=rotate_quats(skew_vectors(rotations), tensors.quats),
-        scales=group_features.sizes[parent_ids, None].expand(-1, 3),
-        sh0=base.sh0[parent_ids],
-    )
-
-
 class TrainingContext(NetworkContext):
     """Networks and their inputs for training: the stages' formulas on tensors, with gradients."""
 
@@ -284,8 +226,34 @@ class TrainingContext(NetworkContext):
         return super().make_tokens(parts, ids, owners, groups_to_arrays(group_features))
 
     def correct_features(self, group_features: GroupFeatures, residuals: Array) -> FeatureGaussians:
-        """Apply corrections ``residuals [g,14]`` to Feature Gaussians, as tensors with a gradient."""
-        return move_feature_tensors(group_features, residuals)
+        """Apply corrections ``residuals [g,14]`` to Feature Gaussians, as tensors with a gradient.
+
+        The corrections are those of :func:`gsmerge.networks.corrections.move_features`.
+        """
+        g, f = group_features, group_features.features
+        # Rotations of the rotation vectors (Rodrigues), also differentiable at zero
+        vectors = rotate_vectors(g.frames, residuals[:, ROTATION_COLUMNS])
+        x, y, z = vectors.unbind(1)
+        zero = torch.zeros_like(x)
+        cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], 1).reshape(-1, 3, 3)
+        angles = (vectors.square().sum(1) + 1e-12).sqrt()[:, None, None]
+        rotations = torch.eye(3) + torch.sin(angles) / angles * cross
+        rotations = rotations + (1 - torch.cos(angles)) / angles**2 * cross @ cross
+        axes, log_stretches = quat_to_rotmat(g.base.quats), residuals[:, SIZE_COLUMNS]
+        stretches = torch.eye(3) + (axes * torch.expm1(log_stretches)[:, None]) @ axes.transpose(1, 2)
+        changes = rotations @ stretches
+        covars = changes @ f.covars @ changes.transpose(1, 2)
+        log_areas = log_stretches[:, 1] + log_stretches[:, 2]  # change of the area of the two largest scales
+        return replace(
+            f,
+            means=f.means
+            + rotate_vectors(g.frames, residuals[:, MEAN_COLUMNS] * gaussian_sizes(g.base.scales)[:, None]),
+            covars=(covars + covars.transpose(1, 2)) / 2,
+            masses=f.masses
+            * torch.exp(residuals[:, LOGIT_COLUMN] + log_stretches[:, 0] + log_areas + residuals[:, MASS_COLUMN]),
+            extinctions=f.extinctions * torch.exp(residuals[:, LOGIT_COLUMN] + log_areas),
+            sh0=f.sh0 + residuals[:, None, COLOR_COLUMNS] / SH_C0,
+        )
 
     def decode_covars(self, features: FeatureGaussians) -> Array:
         """Decode each Feature Gaussian into one child; return the children's covariances, tensors with a gradient."""
@@ -296,11 +264,22 @@ class TrainingContext(NetworkContext):
     def correct_children(
         self, children: Gaussians | None, parents: np.ndarray, group_features: GroupFeatures
     ) -> Gaussians:
-        """Correct the children of groups by the heads. If ``children`` is None, the heads get round Gaussians."""
+        """Correct the children of groups by the heads. If ``children`` is None, the heads get round Gaussians.
+
+        Heads whose outputs are "absolute" make children by correcting round Gaussians.
+        """
         if children is None:
-            arrays = groups_to_arrays(group_features)
-            round_gaussians = prepare_children(arrays.base[parents], parents, arrays, self.options)
-            children = make_round_tensors(parents, group_features, round_gaussians)
+            arrays, parent_ids = groups_to_arrays(group_features), torch.from_numpy(parents)
+            round_gaussians = prepare_children(arrays.base[parents], parents, arrays, self.options).to("cpu")
+            frames, base = group_features.frames[parent_ids], group_features.base
+            rotations = (frames - frames.detach()) @ frames.detach().transpose(1, 2)  # zero, with a gradient
+            children = replace(
+                round_gaussians,
+                means=base.means[parent_ids],
+                quats=rotate_quats(skew_vectors(rotations), round_gaussians.quats),
+                scales=group_features.sizes[parent_ids, None].expand(-1, 3),
+                sh0=base.sh0[parent_ids],
+            )
         corrections = as_tensor(run_heads(children, parents, group_features, self))
         return move_tensors(children, corrections, group_features.frames[torch.from_numpy(parents)])
 
@@ -332,7 +311,12 @@ def refine_crop(crop: Crop, networks: Networks, options: TrainOptions, seed: int
     encoded = context.encode(features_to_tensors(take_features(example.features, crop.rows)))
     encoded = replace(encoded, latents=as_tensor(encoded.latents))  # without an encoder they are an array of zeros
     matches = match(features_to_arrays(encoded), options.match_options())
-    refined = context.refine(_merge(encoded, matches, context))
+    alone, order, cuts = cluster_runs(matches)
+    merged = encoded
+    if len(order) > 0:  # as in gsmerge.stages.merge.merge, but tensors with a gradient
+        pooled = context.merge(pool_tensors(encoded, order, cuts), encoded, order, cuts)
+        merged = FeatureGaussians.concat([take_features(encoded, alone), pooled])
+    refined = context.refine(merged)
     return RefinedCrop(context, context.describe(refined), matches)
 
 
@@ -344,7 +328,13 @@ def decode_crop(refined: RefinedCrop, crop: Crop, k: int) -> Prediction:
     """
     described, context = refined.described, refined.context
     arrays = features_to_arrays(described.features)
-    children, parents = _make_children(crop, arrays, described, context, k)
+    children: Gaussians | None = None
+    parents = np.repeat(np.arange(len(arrays)), k)
+    if not context.makes_children and k == 1:
+        children = described.base
+    elif not context.makes_children:
+        divided, parents = divide_groups(arrays, crop.example.members, np.full(len(arrays), k))
+        children = divided.to("cpu")
     gaussians = context.correct_children(children, parents, described)
     parent_ids, counts = torch.from_numpy(parents), np.bincount(refined.matches.clusters)
     matched = float(counts[counts > 1].sum()) / max(1, len(refined.matches.clusters))
@@ -354,32 +344,6 @@ def decode_crop(refined: RefinedCrop, crop: Crop, k: int) -> Prediction:
 def predict(crop: Crop, networks: Networks, options: TrainOptions, seed: int) -> Prediction:
     """Run all networks on a crop, with gradients."""
     return decode_crop(refine_crop(crop, networks, options, seed), crop, crop.k)
-
-
-def _merge(encoded: FeatureGaussians, matches: Matches, context: TrainingContext) -> FeatureGaussians:
-    """Merge the Feature Gaussians of each cluster, tensors with a gradient; see :func:`gsmerge.stages.merge.merge`."""
-    alone, order, cuts = cluster_runs(matches)
-    if len(order) == 0:
-        return encoded
-    pooled = context.merge(pool_tensors(encoded, order, cuts), encoded, order, cuts)
-    return FeatureGaussians.concat([take_features(encoded, alone), pooled])
-
-
-def _make_children(
-    crop: Crop, arrays: FeatureGaussians, described: GroupFeatures, context: TrainingContext, k: int
-) -> tuple[Gaussians | None, np.ndarray]:
-    """Make ``k`` children of every Feature Gaussian, by closed formulas.
-
-    Return the children, and their parents ``[n]``.
-    Parents are rows of Feature Gaussians, ascending. If the heads make the children, None is returned in place of
-    children.
-    """
-    if context.makes_children:
-        return None, np.repeat(np.arange(len(arrays)), k)
-    if k == 1:
-        return described.base, np.arange(len(arrays))
-    children, parents = divide_groups(arrays, crop.example.members, np.full(len(arrays), k))
-    return children.to("cpu"), parents
 
 
 def analytic_gaussians(crop: Crop, options: TrainOptions) -> Gaussians:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -62,23 +62,18 @@ def prepare_shards(
     shards: list[Shard] = []
     for number, scene in enumerate(scenes):
         progress(f"examples: {example_name(scene)}", number, len(scenes))
-        shards += _scene_shards(scene, options, folder)
+        key, name = scene_key(scene, options), example_name(scene)
+        record = folder / f"{key[:32]}.json"
+        hashes = _read_hashes(record)
+        if hashes is None:
+            hashes = {}
+            for label, make in make_examples(scene, options):
+                path = folder / f"{key[:32]}-{label}.safetensors"
+                hashes[path.name] = write_shard(path, make())
+            with atomic_output(record, overwrite=True) as temporary:  # after all shards
+                temporary.write_bytes(json.dumps(hashes, indent=1).encode() + b"\n")
+        shards += [Shard(folder / file, name, sha256) for file, sha256 in hashes.items()]
     return shards
-
-
-def _scene_shards(scene: Path, options: TrainOptions, folder: Path) -> list[Shard]:
-    """Return the shards of one scene; first make the shards and their record if there is no complete record."""
-    key, name = scene_key(scene, options), example_name(scene)
-    record = folder / f"{key[:32]}.json"
-    hashes = _read_hashes(record)
-    if hashes is None:
-        hashes = {}
-        for label, make in make_examples(scene, options):
-            path = folder / f"{key[:32]}-{label}.safetensors"
-            hashes[path.name] = write_shard(path, make())
-        with atomic_output(record, overwrite=True) as temporary:
-            temporary.write_bytes(json.dumps(hashes, indent=1).encode() + b"\n")
-    return [Shard(folder / file, name, sha256) for file, sha256 in hashes.items()]
 
 
 def scene_key(scene: Path, options: TrainOptions) -> str:
@@ -112,25 +107,21 @@ def write_shard(path: Path, example: Example) -> str:
 
     Raises SceneError if the file cannot be written.
     """
-    arrays = dict(_example_arrays(example))
+    arrays = {
+        f"{part}.{f.name}": np.ascontiguousarray(getattr(getattr(example, part), f.name))
+        for part, kind in STORED_PARTS.items()
+        for f in fields(kind)
+    }
+    for part, cameras in (("cameras", example.cameras), ("photos", example.photos)):
+        arrays[f"{part}.viewmats"] = np.ascontiguousarray(cameras.viewmats)
+        arrays[f"{part}.Ks"] = np.ascontiguousarray(cameras.Ks)
+    arrays |= {"images": example.images, "covers": example.covers}
     facts = {"layout": LAYOUT, "sha256": hash_arrays(arrays), "unit": example.unit, "eps2d": example.photos.eps2d}
     facts |= {"size": [example.cameras.width, example.cameras.height]}
     with atomic_output(path, overwrite=True) as temporary:
         # ``save_file`` would change the rights of the file
         temporary.write_bytes(save(arrays, {EXAMPLE_FORMAT: json.dumps(facts)}))
     return str(facts["sha256"])
-
-
-def _example_arrays(example: Example) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield the name and the values of each array of an example, as they are stored."""
-    for part, kind in STORED_PARTS.items():
-        for f in fields(kind):
-            yield f"{part}.{f.name}", np.ascontiguousarray(getattr(getattr(example, part), f.name))
-    for part, cameras in (("cameras", example.cameras), ("photos", example.photos)):
-        yield f"{part}.viewmats", np.ascontiguousarray(cameras.viewmats)
-        yield f"{part}.Ks", np.ascontiguousarray(cameras.Ks)
-    yield "images", example.images
-    yield "covers", example.covers
 
 
 def hash_arrays(arrays: Mapping[str, np.ndarray]) -> str:

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from gsmerge.kernels.raster.step import WINDOW_SIDE
 from gsmerge.networks.options import SLOTS, NetworkOptions
-from gsmerge.research.training.loss_ssim import LOSS_WINDOW
 from gsmerge.scoring.lpips import require_lpips
 from gsmerge.settings.setting import Settings, setting
 from gsmerge.settings.stages import SEGMENTATIONS, MatchMethod, MatchOptions
@@ -62,7 +62,7 @@ class TrainOptions(Settings):
     photo_scale: int = setting(2, "Factor by which the sides of the photos are divided.", **COUNT_LIMITS)
     photo_side: int = setting(0, "Pixels of the longer side to which larger photos are reduced; it replaces "
         "`photo_scale`. 476 in the paper; 0: not used.", **FROM_0_LIMITS)  # fmt: skip
-    window: int = setting(96, "Side of a window of a photo that is rendered, pixels.", least=LOSS_WINDOW, most=10**9)
+    window: int = setting(96, "Side of a window of a photo that is rendered, pixels.", least=WINDOW_SIDE, most=10**9)
     most: int = setting(
         4000, "Feature Gaussians that may reach into a window; a window with more is halved.", **COUNT_LIMITS
     )

@@ -85,7 +85,15 @@ def sample_window(
     tried first.
     """
     k = levels[int(rng.integers(len(levels)))]
-    photo, pixels = _choose_photo(example, novel, rng)
+    num_views = len(example.cameras)
+    own_photos, novel_photos = rng.permutation(num_views), num_views + rng.permutation(len(example.photos) - num_views)
+    order = np.concatenate([novel_photos, own_photos] if rng.random() < novel else [own_photos, novel_photos])
+    # The first photo with pixels that the views cover is taken; if there is none, the last photo
+    photo, pixels = int(order[0]), np.zeros(0, np.int64)
+    for photo in map(int, order):
+        pixels = np.flatnonzero(example.mask(photo))
+        if len(pixels):
+            break
     pixel = int(pixels[rng.integers(len(pixels))]) if len(pixels) else 0
     photo_height, photo_width = example.images.shape[1:3]
     width, height = min(side, photo_width), min(side, photo_height)
@@ -97,24 +105,6 @@ def sample_window(
         box = box.halved()
         rows = _reaching_rows(example, photo, box)
     return Window(photo, box, Crop(example, k, rows))
-
-
-def _choose_photo(example: Example, novel: float, rng: np.random.Generator) -> tuple[int, np.ndarray]:
-    """Choose a random photo with pixels that the example's views cover.
-
-    Return the number of the photo, and these pixels' indices.
-    ``novel`` is the probability that novel views are tried first. If the views cover no pixel of any photo, the last
-    tried photo is returned, and no indices.
-    """
-    num_views = len(example.cameras)
-    own_photos, novel_photos = rng.permutation(num_views), num_views + rng.permutation(len(example.photos) - num_views)
-    order = np.concatenate([novel_photos, own_photos] if rng.random() < novel else [own_photos, novel_photos])
-    photo, pixels = int(order[0]), np.zeros(0, np.int64)
-    for photo in map(int, order):
-        pixels = np.flatnonzero(example.mask(photo))
-        if len(pixels):
-            break
-    return photo, pixels
 
 
 def _reaching_rows(example: Example, photo: int, box: Box) -> np.ndarray:
