@@ -119,8 +119,9 @@ def compact_files(
     Returns the report, see :func:`gsmerge.results.report.report_document`. Raises SceneError if the scene cannot be
     read or the result cannot be written, and UsageError if the scene lacks something that the settings need.
     """
-    start, out, settings = perf_counter(), outputs.result, settings_for(outputs, settings)
-    format_ = outputs.format
+    start = perf_counter()
+    settings = settings_for(outputs, settings)
+    out, format_ = outputs.result, outputs.format
     with atomic_outputs(overwrite=outputs.overwrite) as add:
         temporary = add(out)  # before the long work, so that an output that cannot be written ends the run at once
         load = read_input(files, opacity=opacity, hints=hints, hashed=hashed)
@@ -137,17 +138,19 @@ def compact_files(
             problem = "expected Gaussians that show something, found none that remains after merging"
             raise SceneError(files.ply, problem, "check its scales and opacities")
         result = result.pad_to_full() if outputs.options.columns == "full" else result
-        compacted_at, results = perf_counter(), (result, *result.coarser)
-        levels, cameras = [level.gaussians for level in results], result.cameras[views]
+        compacted_at = perf_counter()
+        levels = [level.gaussians for level in (result, *result.coarser)]
+        cameras = result.cameras[views]
         comments = result_comments(result.report.new_views, load.comments)
         contents = Contents(levels, comments, cameras, names, scene_title(files.ply))
-        level_files = add_outputs(add, outputs, temporary, contents)  # the first level is the result itself
+        level_files = add_outputs(add, outputs, temporary, contents)
+        _, *coarser_files = level_files  # the first level is the result itself
         notes = [*format_notes(out, result.gaussians), *frame_notes(outputs, cameras), *doubt_changed(load.stats)]
         document = report_document(
             result.report, recognised=load.recognised, output_path=out,
             seconds_before={**(seconds_before or {}), "read": read_at - start},
             seconds_after={"write": perf_counter() - compacted_at},
-            coarser=[(path, level.report) for path, level in zip([*level_files][1:], result.coarser, strict=True)],
+            coarser=[(path, level.report) for path, level in zip(coarser_files, result.coarser, strict=True)],
             notes=[*load.notes, *notes], written_at=level_files, cameras_path=cameras_path,
         )  # fmt: skip
     format_.finish(out)

@@ -64,7 +64,8 @@ def compact(
         "lod-meta.json: levels for streaming. A folder gets SCENE.compact.ply.", "SCENE.compact.ply")] = None,
     overwrite: opt.Overwrite = False, strict: opt.Strict = False, dry_run: opt.DryRun = False,
     open: Annotated[bool | None, opt.option(opt.OUTPUT, "", "Also make a page that compares the scene with the result, "
-        "and open it in the browser.", "--open/--no-open", default="no page; --open for gsmerge SCENE")] = None,
+        "and open it in the browser, or with --no-open only make it.", "--open/--no-open",
+        default="no page; --open for gsmerge SCENE")] = None,
     seed: opt.Seed = None, threads: opt.Threads = None, json: opt.Json = False, progress: opt.Progress = None,
     quiet: opt.Quiet = False,
 ) -> None:  # fmt: skip

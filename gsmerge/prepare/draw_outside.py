@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from gsmerge.errors import count_words
 from gsmerge.fit.outside import outside_cameras
 from gsmerge.geometry.transforms import motion_matrices
 from gsmerge.geometry.views import concat_cameras, even_views, resize_cameras
@@ -54,10 +55,9 @@ def draw_outside(scene: PicturedScene) -> PicturedScene:
     if len(useful) == 0:
         return scene
     placed, counting = placed[useful], counting[useful]
-    note(
-        f"no view sees {100 * outside.mean():.0f} % of the Gaussians; pictures of the input from {len(placed)} places"
-        " beside the views stand for photos there"
-    )
+    places = count_words(len(placed), "place", "beside the views")
+    unseen = f"no view sees {100 * outside.mean():.0f} % of the Gaussians"
+    note(f"{unseen}; pictures of the input from {places} stand for photos there")
     record_choices(placed_views=len(placed))
     return _with_drawings(scene, placed, counting)
 

@@ -128,7 +128,11 @@ def prepare(
     outside: bool = True,
     pixels: bool = True,
 ) -> Prepared:
-    """Collect the facts about a scene that the plan needs; notes name missing data and what replaces it.
+    """Bring a scene to what the stages need; notes name missing data and what replaces it.
+
+    Repeated views are dropped, and views are placed if there are none. Rows and photos are compared: photos that show
+    the scene get its tones and its exposure, and views move to where they agree. Then holes are filled, and what no
+    view sees is drawn.
 
     ``frame`` is the canonical frame; None stands for the scene's own frame. With ``fill``, Gaussians are added at
     pixels that only pictures show. With ``outside``, pictures of Gaussians that no view sees are drawn; it is False if

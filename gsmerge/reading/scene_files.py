@@ -219,8 +219,11 @@ def find_scene_files(
         own_views = path if cameras is None and _holds_views(path) else None
         photos = image_path or (own_views if images is None else None)
         return SceneFiles(path, camera_path or own_views, photos, mask_path, protect, named=named)
-    plys = find_plys(path, camera_path) if os.path.isdir(path) else [path]
-    ply, num_copies = plys[0], len(list_plys(path)) - len(plys) if os.path.isdir(path) else 0
+    plys, num_copies = [path], 0
+    if os.path.isdir(path):
+        plys = find_plys(path, camera_path)
+        num_copies = len(list_plys(path)) - len(plys)
+    ply = plys[0]
     for part in plys:
         check_file(part)
         if part.suffix.lower() in SEVERAL_USES:

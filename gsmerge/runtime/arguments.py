@@ -33,6 +33,7 @@ CLASSES = (
 # Beginning of the annotation of a container -> the types that count as this container
 CONTAINERS = {"Mapping[str, ": Mapping, "Sequence[": list | tuple, "tuple[": list | tuple}
 REMEDIES = {
+    "Mapping": 'pass {"a name": result}',
     "Scene": "gsmerge.read_scene(path) reads one; tensors go to gsmerge.compact_tensors",
     "Gaussians": "pass the .gaussians of a result",
 }

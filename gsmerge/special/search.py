@@ -34,8 +34,9 @@ from gsmerge.stages.counts import level_counts
 from gsmerge.stages.segment import knee_count
 
 # The slope is the gain of PSNR (dB) per doubling of the count. Until two counts were built, a search assumes these
-# slopes, against photos and against renders of the input
-PHOTOS_SLOPE, RENDERS_SLOPE = 1.0, 3.0
+# slopes, against photos and against renders of the input. Photos that were left out gained LEFT_OUT_SLOPE below the
+# usual count, in the mean of eleven captures
+PHOTOS_SLOPE, RENDERS_SLOPE, LEFT_OUT_SLOPE = 1.0, 3.0, 0.3
 SAME_COUNT_RATIO = 1.15  # two counts are the same up to this ratio
 # A search against renders ends at a count whose PSNR is at most this many dB above the target. With RENDERS_SLOPE, a
 # count at which the search ends is at most SAME_COUNT_RATIO times the least count that reaches the target
@@ -163,14 +164,12 @@ class CountSearch:
             most = min(most, self.most)
         # The slope (dB per doubling of the count) is assumed at first. The search ends at a PSNR that is at most
         # ``near`` dB above the target
-        slope, near = PHOTOS_SLOPE, PHOTOS_NEAR_DB if plan.keeps_fidelity else 0.0
         if self.left_out is not None:
-            slope, near = (
-                0.3,
-                0.15,
-            )  # the mean slope of eleven captures below the usual count; half of it is near enough
+            slope, near = LEFT_OUT_SLOPE, LEFT_OUT_SLOPE / 2
         elif self.rendered:
             slope, near = RENDERS_SLOPE, NEAR_DB
+        else:
+            slope, near = PHOTOS_SLOPE, PHOTOS_NEAR_DB if plan.keeps_fidelity else 0.0
         count, most_builds = self.first, MAX_BUILDS if self.left_out is None else MAX_LEFT_OUT_BUILDS
         while count not in self.psnrs and len(self.psnrs) < most_builds:
             self.psnrs[count] = measure(count)

@@ -19,7 +19,7 @@ import numpy as np
 from safetensors.numpy import save
 
 from gsmerge.arrays import as_array
-from gsmerge.errors import SceneError
+from gsmerge.errors import SceneError, count_words
 from gsmerge.io.atomic import atomic_output
 from gsmerge.io.bounds import check_image_size, parse_json, read_budget
 from gsmerge.io.cameras.camera_file import StoredView
@@ -173,7 +173,7 @@ def read_rows(path: Path) -> StoredRows:
     sizes = {name: as_array(column).nbytes for name, column in vars(rows).items()}
     comments, batches = (file.header["about"].get(name) for name in ("comments", "batches"))
     num_batches = len(batches) if isinstance(batches, list) else 0
-    stored = to_stored([Packed(n, num_higher, unpack)], f"{num_batches} batch(es) of views", sizes)
+    stored = to_stored([Packed(n, num_higher, unpack)], f"{count_words(num_batches, 'batch')} of views", sizes)
     copied = copied_comments(comments if isinstance(comments, list) else ())
     pictures, notes = file.header["about"].get("pictures"), tuple[str, ...]()
     others = sorted({str(name)[:40] for name in pictures if name != "photos"}) if isinstance(pictures, list) else []

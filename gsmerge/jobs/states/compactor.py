@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gsmerge.errors import UsageError
+from gsmerge.errors import UsageError, count_words
 from gsmerge.io.formats.table import STATE_ENDING
 from gsmerge.jobs.states.extend import BatchReport, extend
 from gsmerge.jobs.states.features import decode_features, extend_features
@@ -97,7 +97,7 @@ class Compactor:
         return compactor
 
     def __repr__(self) -> str:
-        return f"Compactor({len(self):,} Gaussians of {len(self.batches)} batch(es))"
+        return f"Compactor({len(self):,} Gaussians of {count_words(len(self.batches), 'batch')})"
 
     def __len__(self) -> int:
         """Return the number of Gaussians or Feature Gaussians so far."""

@@ -135,7 +135,7 @@ def test_gaussians_that_no_view_sees_stay_in_a_result(room: Scene, monkeypatch: 
 
     result = compact_part()
     assert len(result.gaussians) == 300
-    assert noted(result.report.notes, "no view sees 5 % of the Gaussians", "from 1 places")
+    assert noted(result.report.notes, "no view sees 5 % of the Gaussians", "from 1 place beside")
     monkeypatch.setattr("gsmerge.prepare.prepare_scene.draw_outside", lambda scene: scene)
     scores = [scenes.psnr_of(gaussians, away) for gaussians in (result.gaussians, compact_part().gaussians)]
     assert scores[0] > scores[1] + 4  # dB: without drawings a part is missing

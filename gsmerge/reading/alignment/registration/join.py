@@ -46,11 +46,12 @@ def join_scenes(scenes: Sequence[Scene], paths: Sequence[Path]) -> JoinedScene:
         remedy = "give photos that overlap by half, name their folder with --images, or compact each file by itself"
         raise SceneError(paths[0], f"{problem} whose photos share enough of it", remedy)
     moved = [move_scene(scenes[i], move) for i in used if (move := registration.similarities[i]) is not None]
-    counts = [registration.matches[i] for i in used]
+    least, most = (extreme(registration.matches[i] for i in used) for extreme in (min, max))
+    counts = f"{least}" if least == most else f"{least} to {most}"
     joined = f"{len(used)} of {len(scenes)} files are joined in the frame of {names[used[0]]}"
     left_out = "is left out: its photo shares too few keypoints with the others"
     notes = [
-        f"{joined}, by {min(counts)} to {max(counts)} keypoints each",
+        f"{joined}, by {counts} keypoints each",
         *(Doubt(f"{name} {left_out}") for i, name in enumerate(names) if i not in used),
     ]
     if len({scene.images is None for scene in moved}) > 1:
