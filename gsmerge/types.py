@@ -131,6 +131,7 @@ class Cameras(ArrayFields):
         Ks: ``[c,3,3]`` intrinsics in pixels; the top-left pixel's centre is (0.5, 0.5).
         width: Image width, pixels.
         height: Image height, pixels.
+        antialiased: Whether Gaussians are drawn as antialiased viewers draw them, see :func:`gsmerge.render`.
 
     Raises:
         ValueError: If the shapes do not fit together or the size is not positive.
@@ -147,6 +148,7 @@ class Cameras(ArrayFields):
     Ks: Array
     width: int
     height: int
+    antialiased: bool = False
 
     def __post_init__(self) -> None:
         check_fields(self)

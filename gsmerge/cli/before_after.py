@@ -90,6 +90,9 @@ def read_before_after(
             " swapped"
         )
     cameras, camera_notes = own_cameras(after, scene)
+    for name, ply in plys.items():  # files of different marks are each drawn their own way
+        if ply.info.antialiased != scene.cameras.antialiased:
+            cameras[name] = replace(cameras.get(name, scene.cameras), antialiased=ply.info.antialiased)
     return BeforeAfter(load, scene, held_out, plys, cameras, [*load.notes, *target_notes, *notes, *camera_notes])
 
 

@@ -10,6 +10,7 @@ from gsmerge.cli.console import print_document, say_notes, stage_progress
 from gsmerge.cli.paths import check_folder, check_outputs, input_files
 from gsmerge.errors import UsageError
 from gsmerge.settings.files import CLIPS, PICTURES
+from gsmerge.settings.reading import NONE
 from gsmerge.settings.setting import Setting
 
 MAX_SIDE = 1 << 20  # pixels; larger than any camera, so that pictures keep the size of the cameras
@@ -39,7 +40,13 @@ def parse_views(text: str) -> int | str:
 
 FRAMES = Setting("Number of frames of a clip, at 30 frames per second, or 12.5 in a GIF.", kind=int, least=2,
                  most=100_000)  # fmt: skip
-BACKGROUND = Setting("Grey level behind the scene, 0 to 1.", kind=float, least=0, most=1)
+BACKGROUND = Setting("Grey level behind the scene, 0 to 1; or none: a .png or .webp of one scene is transparent, other "
+                     "pictures show a chequered ground.", kind=float, least=0, most=1)  # fmt: skip
+
+
+def parse_background(text: str) -> float | str:
+    """Parse ``--background``: a grey level, or "none"."""
+    return NONE if text == NONE else float(BACKGROUND.read(text))
 
 
 def render(
@@ -61,8 +68,8 @@ def render(
     views: Annotated[opt.Parsed | None, opt.option(opt.OUTPUT, "NUMBER|NAME", "Largest number of views, at "
         "equal intervals; or the name of one view, such as 00006 or 6.jpg (6 would be a number).",
         read=opt.reader(parse_views), default="4 on a panel, else all")] = None,
-    background: Annotated[opt.Parsed, opt.option(opt.OUTPUT, "LEVEL", BACKGROUND.help, default=0,
-        read=opt.reader(BACKGROUND.read))] = "0",
+    background: Annotated[opt.Parsed | None, opt.option(opt.OUTPUT, "LEVEL|none", BACKGROUND.help,
+        default="none in a panel, else 0", read=opt.reader(parse_background))] = None,
     overwrite: opt.Overwrite = False, threads: opt.OwnThreads = None, json: opt.Json = False,
     progress: opt.Progress = None, quiet: opt.Quiet = False,
 ) -> None:  # fmt: skip
@@ -86,8 +93,9 @@ def render(
     else:
         check_folder(output, inputs, overwrite=overwrite)
     reading = opt.read_hints(hint, **({"max_side": MAX_SIDE} if kind == "views" else {}))
+    level = None if background == NONE or (background is None and kind == "panel") else background or 0.0
     drawing = drawings.DRAWINGS[kind](
-        drawings.DrawOptions(files, scenes, framing, output, *reading, views, path, frames, size, background)
+        drawings.DrawOptions(files, scenes, framing, output, *reading, views, path, frames, size, level)
     )
     document = {**document_head(), "output": str(output), "pictures": [str(picture) for picture in drawing.paths]}
     document |= drawing.facts | note_entries(drawing.facts["notes"])

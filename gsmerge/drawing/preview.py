@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -16,6 +15,7 @@ from gsmerge.errors import SceneError
 from gsmerge.io import atomic_output
 from gsmerge.raster import render
 from gsmerge.raster.metrics import psnr, psnr_words
+from gsmerge.raster.photos import COVERED_TRANSMITTANCE, WHOLE_SHARE
 from gsmerge.types import Cameras, Gaussians
 
 BytePicture = NDArray[np.uint8]  # [h,w,3], sRGB
@@ -26,21 +26,37 @@ MAX_SIDES = {".webp": 16383, ".jpg": 65500, ".jpeg": 65500}  # largest side that
 LABEL_HEIGHT, LABEL_WIDTH = 22, 640
 LABEL_LEVEL = 32  # grey level of labels, and of cells without a photo
 GAP_PIXELS = 4  # pixels between pictures
+CHEQUER_LEVELS = 0.4, 0.6  # of the squares of a chequered ground
 OUTSIDE_VIEW = "step back"  # name of the outside view
 
 
 def to_picture(image: np.ndarray) -> BytePicture:
-    """Convert a picture ``[h,w,3]``, float in [0, 1], to 8 bits."""
+    """Convert a picture ``[h,w,3]``, float in [0, 1], to 8 bits; also a transparent one, ``[h,w,4]``."""
     return (image.clip(0, 1) * 255).round().astype(np.uint8)
 
 
+def lay_on_chequer(image: np.ndarray, transmittance: np.ndarray) -> np.ndarray:
+    """Lay a picture ``[h,w,3]`` on a chequered ground, which shows where nothing is; float in [0, 1].
+
+    Colours are multiplied by alpha; ``transmittance [h,w]`` is 1 - alpha.
+    """
+    side = max(8, image.shape[1] // 48)  # of a square, pixels
+    rows, columns = np.ogrid[: image.shape[0], : image.shape[1]]
+    ground = np.where((rows // side + columns // side) % 2, *CHEQUER_LEVELS) * transmittance
+    return np.asarray(image + ground[..., None].astype(np.float32))
+
+
 def save_picture(path: Path, picture: BytePicture, *, overwrite: bool = True) -> None:
-    """Write a picture ``[h,w,3]`` in the format of the file name, or raise SceneError if a side is too long for it."""
+    """Write a picture ``[h,w,3]``, or ``[h,w,4]`` with alpha, in the format of the file name.
+
+    SceneError if a side is too long for the format.
+    """
     max_side, (height, width) = MAX_SIDES.get(path.suffix.lower(), math.inf), picture.shape[:2]
     if max(height, width) > max_side:
         problem = f"expected at most {max_side:,} pixels per side of a {path.suffix}, got {width} x {height}"
         raise SceneError(path, problem, "name a .png, or lower --size")
-    _, data = cv2.imencode(path.suffix, np.ascontiguousarray(picture[..., ::-1]))
+    channels = [2, 1, 0, 3][: picture.shape[-1]]  # the order of OpenCV
+    _, data = cv2.imencode(path.suffix, np.ascontiguousarray(picture[..., channels]))
     with atomic_output(path, overwrite=overwrite) as temporary:
         temporary.write_bytes(data.tobytes())
 
@@ -78,19 +94,26 @@ def view_pictures(
     cameras: Cameras,
     photos: Sequence[np.ndarray | None] | None = None,
     names: Sequence[str] | None = None,
-    **drawing: Any,
+    *,
+    marks: Sequence[bool | None] | None = None,
+    background: float | None = 0.0,
 ) -> list[list[tuple[str, BytePicture]]]:
     """Render each scene in every view; return a row of pictures for each view, each with a line of text.
 
     A row begins with the photo ``[h,w,3]``, or with a dark picture if the photo is None. If ``photos`` is None, rows
     have scenes only. The text of a photo has the name of the view. The text of a render has the scene's name, its
     number of Gaussians, and the PSNR against the photo or, if ``photos`` is None, against the render of the first
-    scene. ``drawing`` is passed to :func:`gsmerge.render`.
+    scene. ``marks`` say which scenes are drawn antialiased; None: as the cameras say. If ``background`` is None,
+    pictures lie on a chequered ground, and PSNR are measured where the first scene shows something.
     """
-    renders = [render(gaussians, cameras, **drawing).images.clip(0, 1) for _, gaussians in scenes]
+    drawn = [
+        render(gaussians, cameras, background or 0.0, antialiased=mark)
+        for (_, gaussians), mark in zip(scenes, marks or [None] * len(scenes), strict=True)
+    ]
+    renders = [one.images.clip(0, 1) for one in drawn]
     views = []
     for row, view in enumerate(names or [f"view {i}" for i in range(len(cameras))]):
-        columns = [(f"{name}: {len(g):,}", drawn[row]) for (name, g), drawn in zip(scenes, renders, strict=True)]
+        columns = [(f"{name}: {len(g):,}", images[row]) for (name, g), images in zip(scenes, renders, strict=True)]
         photo = None if photos is None else photos[row]
         if photo is not None:
             columns.insert(0, (f"{view}, photo", photo))
@@ -99,23 +122,39 @@ def view_pictures(
         if photo is not None or photos is None:
             (_, reference), *compared = columns
             name = "the photo" if photos is not None else scenes[0][0]
-            columns[1:] = [(f"{text}, {psnr_words(psnr(im, reference))} to {name}", im) for text, im in compared]
+            covered = 1 - drawn[0].alphas[row, ..., 0] < COVERED_TRANSMITTANCE
+            mask = covered if background is None and 0 < covered.mean() < WHOLE_SHARE else None
+            name += "" if mask is None else ", where the scene is"
+            columns[1:] = [(f"{text}, {psnr_words(psnr(im, reference, mask))} to {name}", im) for text, im in compared]
+        if background is None:
+            shown = [lay_on_chequer(one.images[row], 1 - one.alphas[row, ..., 0]) for one in drawn]
+            columns[-len(scenes) :] = [(text, im) for (text, _), im in zip(columns[-len(scenes) :], shown, strict=True)]
         views.append([(text, to_picture(image)) for text, image in columns])
     return views
 
 
 def outside_pictures(
-    scenes: Sequence[tuple[str, Gaussians]], cameras: Cameras, *, photos: bool, **drawing: Any
+    scenes: Sequence[tuple[str, Gaussians]],
+    cameras: Cameras,
+    *,
+    photos: bool,
+    marks: Sequence[bool | None] | None = None,
+    background: float | None = 0.0,
 ) -> list[tuple[str, BytePicture]]:
     """Render each scene from outside the capture; return a row of pictures, each with a line of text.
 
     The row fits below the rows of :func:`view_pictures`. If these rows begin with ``photos``, the row from outside
-    begins with a dark picture, because there is no photo from outside.
+    begins with a dark picture, because there is no photo from outside. ``marks`` and ``background`` are those of
+    :func:`view_pictures`.
     """
     camera, _ = outside_camera(cameras, scenes[0][1].means)
-    renders = [
-        (f"{name}: {OUTSIDE_VIEW}", to_picture(render(scene, camera, **drawing).images[0])) for name, scene in scenes
-    ]
+    renders = []
+    for (name, gaussians), mark in zip(scenes, marks or [None] * len(scenes), strict=True):
+        drawn = render(gaussians, camera, background or 0.0, antialiased=mark)
+        image = drawn.images[0]
+        if background is None:
+            image = lay_on_chequer(image, 1 - drawn.alphas[0, ..., 0])
+        renders.append((f"{name}: {OUTSIDE_VIEW}", to_picture(image)))
     return ([(f"{OUTSIDE_VIEW}: no photo", np.full_like(renders[0][1], LABEL_LEVEL))] if photos else []) + renders
 
 

@@ -8,6 +8,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from gsmerge.drawing.camera_path import parse_camera_path, sample_path, viewing_depth
 from gsmerge.drawing.clip import (
     FOLDER_HINT,
@@ -23,6 +25,7 @@ from gsmerge.drawing.clip import (
 from gsmerge.drawing.preview import (
     BytePicture,
     contact_sheet,
+    lay_on_chequer,
     outside_pictures,
     save_picture,
     to_picture,
@@ -34,6 +37,7 @@ from gsmerge.io import file_notes, read_cameras, read_gaussians, to_cameras
 from gsmerge.io.atomic import atomic_outputs, common_mode
 from gsmerge.io.cameras.camera_file import sizes_of
 from gsmerge.io.cameras.read_cameras import read_sharp_camera
+from gsmerge.io.formats.read_gaussians import FileInfo
 from gsmerge.io.image_names import IMAGE_SUFFIXES
 from gsmerge.prepare.place_cameras import add_views
 from gsmerge.raster import render_in_batches
@@ -46,7 +50,7 @@ from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.record import Progress, record_run
 from gsmerge.runtime.threads import use_threads
 from gsmerge.scoring.sizes import fill_cameras, fill_photo, shrink_cameras
-from gsmerge.settings.files import CLIPS, GIF, PICTURES
+from gsmerge.settings.files import CLIPS, GIF, PICTURES, TRANSPARENT
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.types import Cameras, Gaussians, StrPath
 
@@ -71,7 +75,9 @@ class DrawOptions:
     path: str | None = None  # text of gsmerge.drawing.camera_path.parse_camera_path, or a file of cameras
     frames: int | None = None  # frames of a path; None: enough for SECONDS; for a spline also VIEW_FRAMES per view
     size: tuple[int, int] | None = None  # width and height of a picture; None: the size of the cameras
-    background: float = 0.0  # grey level in [0, 1]
+    # Grey level in [0, 1]; None: nothing, so that a .png or .webp of one scene is transparent, and other pictures have
+    # a chequered ground
+    background: float | None = None
 
     def choose(self, names: Sequence[str], most: int | None = None) -> list[int]:
         """Choose the ids of the views to draw: as the option ``views`` says, otherwise at most ``most``, or all."""
@@ -106,7 +112,7 @@ class DrawnScenes:
     """Scenes to draw together. All scenes share the frame of one scene, and are drawn in its views."""
 
     scenes: list[tuple[Path, Gaussians]]
-    sizes: list[int]  # bytes of their files
+    infos: list[FileInfo]  # facts about their files
     notes: list[str]
     load: Loaded  # the scene whose frame and views are used
 
@@ -121,25 +127,35 @@ class DrawnScenes:
         threads: int,
         near: float = 0.01,
         borders: Sequence[Sequence[int]] | None = None,
+        *,
+        transparent: bool = False,
     ) -> Iterator[tuple[BytePicture, ...]]:
         """Yield, for each camera, the 8-bit pictures of all scenes, with one view per thread in memory.
 
+        With ``transparent`` and without a background, pictures have alpha; otherwise a chequered ground replaces it.
         ``borders`` are the borders in each picture, see :func:`gsmerge.drawing.clip.swipe_borders`. Scene i is shown
         between the borders i and i + 1. Other columns of its picture need not be drawn, and may show the background
         only.
         """
-        settings: dict[str, Any] = {"at_once": threads, "near": near, "convert": to_picture}
+        on_chequer = options.background is None and not transparent
+        convert = np.asarray if on_chequer else to_picture
+        settings: dict[str, Any] = {"at_once": threads, "near": near, "convert": convert}
         drawn = (
             render_in_batches(
                 gaussians,
-                cameras,
+                replace(cameras, antialiased=info.antialiased),
                 options.background,
                 columns=None if borders is None else [(row[i], row[i + 1]) for row in borders],
                 **settings,
             )
-            for i, (_, gaussians) in enumerate(self.scenes)
+            for i, ((_, gaussians), info) in enumerate(zip(self.scenes, self.infos, strict=True))
         )
-        return zip(*drawn, strict=True)
+        for pictures in zip(*drawn, strict=True):
+            if on_chequer:
+                laid = (lay_on_chequer(image[..., :3] * image[..., 3:], 1 - image[..., 3]) for image in pictures)
+                yield tuple(map(to_picture, laid))
+            else:
+                yield pictures
 
 
 def frame_files(files: SceneFiles, cameras: StrPath | None, images: StrPath | None) -> SceneFiles:
@@ -173,10 +189,13 @@ def prepare_panel(options: DrawOptions) -> Drawing:
         shown = None if photos is None else [photos[i] if i in pictured else None for i in ids]
         if shown and options.size:
             shown = [None if photo is None else fill_photo(photo, *options.size) for photo in shown]
-        rows = view_pictures(named, cameras[ids], shown, names, background=options.background)
+        marks = [info.antialiased for info in group.infos]
+        rows = view_pictures(named, cameras[ids], shown, names, marks=marks, background=options.background)
         # If the scene has no cameras, gsmerge placed the views, the first half around the scene, the others inside it
         outer_cameras = cameras if group.load.cameras is not None else cameras[: len(cameras) // 2]
-        outside = outside_pictures(named, outer_cameras, photos=shown is not None, background=options.background)
+        outside = outside_pictures(
+            named, outer_cameras, photos=shown is not None, marks=marks, background=options.background
+        )
         yield contact_sheet([*rows, outside])
 
     facts = {"scenes": group.counts(), "views": ids, "photos": len(pictured) > 0, "notes": group.notes}
@@ -193,7 +212,8 @@ def prepare_pictures(options: DrawOptions) -> Drawing:
 
     def draw(threads: int) -> Iterator[BytePicture]:
         """Yield a picture for each camera. Several scenes are side by side, with their names."""
-        for pictures in group.draw(views, options, threads):
+        transparent = len(group.scenes) == 1 and (is_folder or options.output.suffix.lower() in TRANSPARENT)
+        for pictures in group.draw(views, options, threads, transparent=transparent):
             yield contact_sheet([list(zip(names, pictures, strict=True))]) if len(pictures) > 1 else pictures[0]
 
     facts = {"width": views.width, "height": views.height, "scenes": group.counts(), "views": ids, "notes": group.notes}
@@ -207,8 +227,12 @@ def prepare_clip(options: DrawOptions) -> Drawing:
     paths = [path.absolute() for path, _ in group.scenes]
     repeats_names = len({path.name for path in paths}) < len(paths)
     texts = [
-        ("/".join(path.parts[-2:]) if repeats_names else path.name, f"{len(gaussians):,} Gaussians", human_bytes(size))
-        for path, (_, gaussians), size in zip(paths, group.scenes, group.sizes, strict=True)
+        (
+            "/".join(path.parts[-2:]) if repeats_names else path.name,
+            f"{len(gaussians):,} Gaussians",
+            human_bytes(info.file_bytes),
+        )
+        for path, (_, gaussians), info in zip(paths, group.scenes, group.infos, strict=True)
     ]
 
     def draw(threads: int) -> Iterator[BytePicture]:
@@ -302,8 +326,8 @@ def _read_scenes(options: DrawOptions, *, photos: bool) -> DrawnScenes:
     scenes = [load.scene.file_gaussians if same_file else first_ply.gaussians, *(ply.gaussians for ply in plys)]
     notes = [[*([] if same_file else file_notes(first_ply.info)), *load.notes], *(file_notes(ply.info) for ply in plys)]
     notes_with_paths = [note for path, texts in zip(paths, notes, strict=True) for note in name_notes(path, texts)]
-    sizes = [file.info.file_bytes for file in (first_ply, *plys)]
-    return DrawnScenes(list(zip(paths, scenes, strict=True)), sizes, notes_with_paths if plys else list(notes[0]), load)
+    infos = [file.info for file in (first_ply, *plys)]
+    return DrawnScenes(list(zip(paths, scenes, strict=True)), infos, notes_with_paths if plys else list(notes[0]), load)
 
 
 def find_view(view: str, names: Sequence[str]) -> int:

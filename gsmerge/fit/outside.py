@@ -96,7 +96,7 @@ def place_outside_views(scene: Scene, start: Gaussians, photos: Photos, options:
     sample = sample_gaussians(scene, GAUSSIANS_PER_PHOTO * min(len(photos), PLACES)) if len(scene.gaussians) else start
     if len(sample) == 0 or len(photos) == 0:
         return None
-    cameras = Cameras(photos.viewmats, photos.Ks, photos.width, photos.height)
+    cameras = Cameras(photos.viewmats, photos.Ks, photos.width, photos.height, photos.antialiased)
     points = sample.means[:: max(1, len(sample) // DEPTH_GAUSSIANS)]
     placed = outside_cameras(points, cameras, min(num_steps, max(PLACES, len(photos))), STEP_BACK_LOW, STEP_BACK_HIGH)
     # the depths of a view are the depths of points in the camera from which it steps back, each of `cameras` in turn

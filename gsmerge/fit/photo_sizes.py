@@ -105,7 +105,9 @@ def large_photos(scene: Scene, scale: float) -> Photos:
 
     Ks = large.Ks * np.array([[width / large.width], [height / large.height], [1.0]])
     pictures = np.stack(parallel_map(read, large.ids))
-    return with_pixel_values(Photos(pictures, cameras.viewmats.astype(np.float64), Ks, EPS2D), scene)
+    return with_pixel_values(
+        Photos(pictures, cameras.viewmats.astype(np.float64), Ks, EPS2D, antialiased=cameras.antialiased), scene
+    )
 
 
 def training_weights(photos: Photos, share: float, seed: int) -> list[np.ndarray]:

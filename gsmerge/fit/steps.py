@@ -114,7 +114,7 @@ class Optimiser:
         """Return the pixels ``[h,w,3]`` float32 of a photo with which a step compares, and the camera for them."""
         photos, mode, sample = self.photos[step.mode.size], step.mode, step.sample
         camera = photos.camera(step.view, sample)
-        camera |= {"eps2d": mode.eps2d / sample.stride**2, "antialiased": mode.antialiased}
+        camera |= {"eps2d": mode.eps2d / sample.stride**2, "antialiased": mode.antialiased or photos.antialiased}
         return np.ascontiguousarray(photos.image(step.view, step.background, sample), np.float32), camera
 
     def drawn_opacities(self, state: FitState, step: Step) -> np.ndarray:

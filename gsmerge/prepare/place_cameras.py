@@ -80,7 +80,8 @@ def add_views(scene: Scene, *, shown: bool = False, placed: str = NO_VIEWS) -> S
         note(placed if inside is None else VIEWER_VIEWS)
         cameras = inside or (_place_around_and_inside if shown else place_around)(scene.gaussians)
         order = sorted(range(len(cameras)), key=lambda view: (view + 1) % HELD_OUT != 0)  # held-out cameras come first
-        scene = _with_cameras(scene.gaussians, cameras if shown else cameras[order])
+        cameras = replace(cameras if shown else cameras[order], antialiased=scene.cameras.antialiased)
+        scene = _with_cameras(scene.gaussians, cameras)
     return scene
 
 
@@ -175,6 +176,7 @@ def draw_around(scene: PicturedScene) -> PicturedScene:
         pixels=None,
         images=np.concatenate([scene.images, drawn.images]),
         empty=np.concatenate([scene.empty, drawn.empty]),
+        importance=None,  # all of these pictures are renders
     )
 
 

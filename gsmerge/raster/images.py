@@ -30,7 +30,7 @@ def render(
     cameras: Cameras,
     background: float | Sequence[float] | Array = 0.0,
     *,
-    antialiased: bool = False,
+    antialiased: bool | None = None,
     near: float = 0.01,
     far: float = FAR_PLANE,
     with_depths: bool = False,
@@ -47,7 +47,8 @@ def render(
         gaussians: n Gaussians, SH degrees 0 to 4.
         cameras: c cameras, whose skew is ignored.
         background: Colour behind the Gaussians, 1 or 3 numbers.
-        antialiased: Lower the opacity of small Gaussians to compensate for the dilation.
+        antialiased: Lower the opacity of small Gaussians to compensate for the dilation; None: as ``cameras`` say,
+            which have the mark of a scene's file.
         near: Nearest depth drawn, world units, above 0.
         far: Farthest depth drawn.
         with_depths: Also render the mean depth.
@@ -64,7 +65,8 @@ def render(
         (5, 32, 48, 3)
     """
     background_rgb = background_color(background.detach().cpu() if hasattr(background, "detach") else background)
-    options: dict[str, Any] = {"antialiased": antialiased, "near": near, "far": far}
+    options: dict[str, Any] = {"near": near, "far": far}
+    options["antialiased"] = cameras.antialiased if antialiased is None else antialiased
     values = (*vars(gaussians).values(), cameras.viewmats, cameras.Ks)
     tensors = [value for value in values if not isinstance(value, np.ndarray)]
     needs_gradient = False
@@ -90,7 +92,7 @@ def render(
 def render_in_batches(
     gaussians: Gaussians,
     cameras: Cameras,
-    background: float | Sequence[float] = 0.0,
+    background: float | Sequence[float] | None = 0.0,
     *,
     at_once: int,
     near: float = 0.01,
@@ -99,24 +101,35 @@ def render_in_batches(
 ) -> Iterator[np.ndarray]:
     """Yield the images ``[h,w,3]`` of :func:`render`, with the same bits, each after ``convert``.
 
+    If ``background`` is None, the images ``[h,w,4]`` have alpha, by which their colours are not multiplied.
     At most ``at_once`` images are in memory. Large images are drawn and converted in bands, so ``convert`` has to work
     pixel by pixel. ``columns`` has, for each image, the first column of pixels to draw and the column after the last.
     Tiles outside the columns to draw may show the background only.
     """
-    background_rgb = background_color(background)
-    tile_one = _make_tiler(gaussians, cameras, {"near": near}, columns)
+    background_rgb = background_color(background or 0.0)
+    tile_one = _make_tiler(gaussians, cameras, {"antialiased": cameras.antialiased, "near": near}, columns)
+
+    def finish(image: np.ndarray, alpha: np.ndarray) -> np.ndarray:
+        """Return the image, or if there is no background, with alpha, its colours no longer multiplied by alpha."""
+        if background is not None:
+            return image
+        colors = image / np.maximum(alpha, np.float32(1e-6))[..., None]
+        return np.concatenate([colors, alpha[..., None]], -1)
+
     lines, band_lines = -(-cameras.height // TILE), max(1, BAND_PIXELS // (cameras.width * TILE))
     if lines > band_lines:
         bands = [(first_line, min(first_line + band_lines, lines)) for first_line in range(0, lines, band_lines)]
         for view in range(len(cameras)):
             tiled_bands = (tile_one(view, band) for band in bands)
-            yield np.concatenate([convert(blend(t, view_colors(t), background_rgb)[0]) for t in tiled_bands])
+            blended = (blend(tiled, view_colors(tiled), background_rgb) for tiled in tiled_bands)
+            yield np.concatenate([convert(finish(image, 1 - transmittance)) for image, transmittance in blended])
         return
     for first_view in range(0, len(cameras), at_once):
         count = min(at_once, len(cameras) - first_view)
         shape = count, cameras.height, cameras.width
         drawn = draw_views(tile_one, shape, background_rgb, with_depths=False, first_view=first_view)
-        yield from map(convert, drawn.images)
+        for image, alpha in zip(drawn.images, drawn.alphas[..., 0], strict=True):
+            yield convert(finish(image, alpha))
 
 
 def _make_tiler(
@@ -144,7 +157,8 @@ def tile_views(scene: Scene, use: Callable[[int, TiledView], None], views: Seque
 
     def tile_and_use(view: int) -> None:
         """Tile one view, and call ``use`` for it."""
-        use(view, tile_view(splats, viewmats[view], Ks[view], cameras.width, cameras.height, near=NEAR_PLANE))
+        camera = viewmats[view], Ks[view], cameras.width, cameras.height
+        use(view, tile_view(splats, *camera, antialiased=cameras.antialiased, near=NEAR_PLANE))
 
     view_ids = range(len(scene)) if views is None else views
     if len(splats) <= ONE_AT_A_TIME:

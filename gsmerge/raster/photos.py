@@ -88,6 +88,7 @@ class Photos:
     weights: np.ndarray | None = None  # [v,h,w] float32, weight of each pixel in [0, 1], by default 1
     empty: np.ndarray | None = None  # [v,h,w] float32 share of each pixel that shows the background, by default 0
     importance: np.ndarray | None = None  # [v,h,w] float32, weight of each pixel in a fit, by default 1
+    antialiased: bool = False  # whether viewers draw the Gaussians antialiased
 
     def __len__(self) -> int:
         return len(self.images)
@@ -97,9 +98,13 @@ class Photos:
         ids: list[int] | slice = list(views)
         if views and ids == list(range(views[0], views[0] + len(views))):
             ids = slice(views[0], views[0] + len(views))
-        maps = (self.weights, self.empty, self.importance)
-        selected = (None if values is None else values[ids] for values in maps)
-        return Photos(self.images[ids], self.viewmats[ids], self.Ks[ids], self.eps2d, *selected)
+        weights, empty, importance = (
+            None if values is None else values[ids] for values in (self.weights, self.empty, self.importance)
+        )
+        return replace(
+            self, images=self.images[ids], viewmats=self.viewmats[ids], Ks=self.Ks[ids],
+            weights=weights, empty=empty, importance=importance,
+        )  # fmt: skip
 
     @property
     def height(self) -> int:
@@ -134,6 +139,7 @@ class Photos:
             "width": len(range(sample.column, self.width, stride)),
             "height": len(range(sample.row, self.height, stride)),
             "eps2d": self.eps2d / stride**2,
+            "antialiased": self.antialiased,
         }
 
 
@@ -213,7 +219,7 @@ def blank_photos(cameras: Cameras, level: float = 1) -> Photos:
     width, height = max(1, round(w / level)), max(1, round(h / level))
     black = np.broadcast_to(np.float32(0), (len(cameras), height, width, 3))
     sx, sy = width / w, height / h
-    return Photos(black, viewmats, Ks * np.array([[sx], [sy], [1.0]]), EPS2D * sx * sy)
+    return Photos(black, viewmats, Ks * np.array([[sx], [sy], [1.0]]), EPS2D * sx * sy, antialiased=cameras.antialiased)
 
 
 def photo_errors(

@@ -476,7 +476,8 @@ def _make_loaded(
     faint = count_words(num_faint, "Gaussian", "fainter than 1/255, which nothing draws, set aside")
     photos = result.images if len(result.images) else None
     names = () if camera_file is None else camera_file.names
-    scene = Scene(gaussians, result.cameras, photos, pixels, names)
+    cameras = replace(result.cameras, antialiased=ply.info.antialiased)
+    scene = Scene(gaussians, cameras, photos, pixels, names)
     last_rows = () if pixels is None else pixels.fronts.max((1, 2))  # -1 for a view without rows
     empty_views = [scene.names[view] for view, row in enumerate(last_rows) if row < 0 and view not in absent]
     views_have = f"{len(empty_views)} of {len(scene)} views {'has' if len(empty_views) == 1 else 'have'}"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from itertools import count
 
@@ -78,6 +78,7 @@ class ResultScores:
     render_seconds: float  # median wall time of one view with all threads
     scores: tuple[ViewScore, ...]  # one for each view
     fog: Mapping[str, Fog] = field(default_factory=dict)  # by kind of camera; empty for the input, or if not measured
+    antialiased: bool = False  # how its Gaussians were drawn, see :func:`gsmerge.render`
 
     def __repr__(self) -> str:
         return f"ResultScores({self.name!r}, {self.num_gaussians:,} Gaussians, {len(self.scores)} views)"
@@ -173,7 +174,7 @@ class _Renderer:
 
     def draw(self, gaussians: Gaussians, cameras: Cameras, view: int) -> tuple[np.ndarray, np.ndarray]:
         """Render one view ``[h,w,3]``; also return the mask ``[h,w]`` of the pixels with an opacity above a half."""
-        drawn = render(gaussians, cameras[[view]], near=self.near, antialiased=self.options.antialiased)
+        drawn = render(gaussians, cameras[[view]], near=self.near)
         return np.asarray(drawn.images[0].clip(0, 1)), np.asarray(1 - drawn.alphas[0, ..., 0] < COVERED_TRANSMITTANCE)
 
     def image(self, gaussians: Gaussians, cameras: Cameras, view: int) -> np.ndarray:
@@ -200,7 +201,8 @@ def evaluate(
         targets: Held-out views in the scene's world, see :func:`gsmerge.reading.held_out.read_held_out`.
         options: Settings; None: the defaults, with LPIPS if its weights are installed.
         cameras: Cameras of the input views, by name of a result, for results that were made with other poses than the
-            scene's. Such a result has these cameras as ``CompactResult.cameras``.
+            scene's, or that are drawn in another way (their field ``antialiased``). Results of :func:`gsmerge.compact`
+            have them as ``CompactResult.cameras``.
         progress: Called with (name of the step, number done, total); the step of a result is "evaluate: NAME".
         on_image: Called with (result, split, number of the view in the split, render ``[h,w,3]`` in [0, 1]).
 
@@ -229,6 +231,7 @@ def evaluate(
     if len(scene) == 0:
         raise UsageError("expected a scene with views, got none")
     check_scene(scene)
+    scene, marks = _find_marks(scene, results, cameras or {}, options)
     original = scene if scene.images is None else replace(scene, images=as_pictures(scene.images))
     scene, mended = scored_pictures(original)
     inputs = scene.file_gaussians
@@ -242,8 +245,8 @@ def evaluate(
         progress("what the input views see", 0, 0)
         splits = _make_splits(scene, PHOTOS if scene is original else ROW_COLORS, inputs, targets, renderer)
         scored = {INPUT: inputs, **outputs} if options.own else outputs
-        has_fog = options.fog and bool(outputs)
-        fog = measure_fog(scene.gaussians.numpy(), outputs, scene.cameras, renderer.near, progress) if has_fog else {}
+        compared = scene.gaussians.numpy(), outputs, scene.cameras, renderer.near, progress, marks
+        fog = measure_fog(*compared) if options.fog and outputs else {}
         num_pictures, numbers = len(scored) * sum(len(split.views) for split in splits.values()), count(1)
 
         def report_image(name: str, kind: str, view: int, image: np.ndarray) -> None:
@@ -253,7 +256,7 @@ def evaluate(
 
         renderer.image(inputs[:1], scene.cameras, 0)  # loads the kernels, before times are measured
         split_scores = [
-            _score_split(kind, split, scored, cameras if kind == "context" else {}, renderer, report_image)
+            _score_split(kind, split, scored, cameras if kind == "context" else {}, marks, renderer, report_image)
             for kind, split in splits.items()
         ]
     scores = []
@@ -261,13 +264,26 @@ def evaluate(
         timed_views = [view for views_by_name in split_scores for view in views_by_name[name]]
         seconds = float(np.median([seconds for seconds, _ in timed_views]))
         views, ratio = tuple(view for _, view in timed_views), len(gaussians) / max(len(inputs), 1)
-        scores.append(ResultScores(name, len(gaussians), ratio, seconds, views, fog.get(name, {})))
-    # Words for the pictures with which results are compared, in held-out views first
-    references = list(dict.fromkeys(splits[kind].reference for kind in ("target", "context") if kind in splits))
-    words = f"{references[0]}, and {references[1]} in its own views" if len(references) > 1 else references[0]
+        scores.append(ResultScores(name, len(gaussians), ratio, seconds, views, fog.get(name, {}), marks[name]))
     counts = {name: len(split.scored) for name, split in splits.items()}
     notes = (*lpips_notes, *_describe_scores(splits, scores, mended=mended))
-    return Evaluation(tuple(scores), words, counts, notes, options, scene.images)
+    return Evaluation(tuple(scores), _describe_references(splits), counts, notes, options, scene.images)
+
+
+def _describe_references(splits: Mapping[str, _Split]) -> str:
+    """Return words for the pictures with which results are compared, in held-out views first."""
+    references = list(dict.fromkeys(splits[kind].reference for kind in ("target", "context") if kind in splits))
+    return f"{references[0]}, and {references[1]} in its own views" if len(references) > 1 else references[0]
+
+
+def _find_marks(
+    scene: Scene, names: Iterable[str], cameras: Mapping[str, Cameras], options: EvaluateOptions
+) -> tuple[Scene, dict[str, bool]]:
+    """Return the scene as it is drawn, and by name of the input and of each result, whether it is drawn antialiased."""
+    marks = {name: moved.antialiased for name, moved in cameras.items()}
+    if options.antialiased is not None:
+        scene, marks = replace(scene, cameras=replace(scene.cameras, antialiased=options.antialiased)), {}
+    return scene, {**dict.fromkeys((INPUT, *names), scene.cameras.antialiased), **marks}
 
 
 def near_plane(scene: Scene) -> float:
@@ -338,6 +354,7 @@ def _score_split(
     split: _Split,
     results: Mapping[str, Gaussians],
     cameras: Mapping[str, Cameras],
+    marks: Mapping[str, bool],
     renderer: _Renderer,
     on_image: OnImage,
 ) -> dict[str, list[tuple[float, ViewScore]]]:
@@ -345,7 +362,7 @@ def _score_split(
 
     Returns, by the name of each result, the seconds of drawing and the score of each view. A split is a set of views:
     the input views, or held-out ones. ``kind`` is its name. If a result was made with other poses than the scene's,
-    ``cameras`` has its cameras.
+    ``cameras`` has its cameras. ``marks`` says, by name, which results are drawn antialiased.
     """
     options, names = renderer.options, split.views.names
     lpips_views = pick_views(len(names), options.lpips_views or len(names))
@@ -356,8 +373,9 @@ def _score_split(
         covered = None if split.covered is None else split.covered[view]
         nets = options.lpips if view in lpips_views else ()
         for name, gaussians in results.items():
+            own_cameras = replace(moved.get(name, split.views.cameras), antialiased=marks[name])
             start = time.perf_counter()
-            image, is_opaque = renderer.draw(gaussians, moved.get(name, split.views.cameras), view)
+            image, is_opaque = renderer.draw(gaussians, own_cameras, view)
             seconds = time.perf_counter() - start
             on_image(name, kind, view, image)
             if name == INPUT and covered is None:

@@ -41,8 +41,8 @@ def evaluation_document(
 
     The document has version, tool, reference, numbers of views, results and notes. A result has its facts, count,
     ratio, render seconds, fog, holes, veils and spikes (null for the input), means by split, and a score for each view.
-    ``photo_side`` is present unless 0, ``antialiased`` is present if true, and ``lpips_views`` if some split has views
-    without LPIPS. Within a schema version keys may be added, but not removed.
+    ``photo_side`` is present unless 0, ``antialiased`` if all results, or a result, are drawn so, and ``lpips_views``
+    if some split has views without LPIPS. Within a schema version keys may be added, but not removed.
     """
     num_views = evaluation.options.lpips_views
     some_lpips = evaluation.options.lpips and num_views and num_views < max(evaluation.num_views.values())
@@ -50,7 +50,7 @@ def evaluation_document(
         **document_head(),
         "reference": evaluation.reference,
         **({"photo_side": evaluation.options.photo_side} if evaluation.options.photo_side else {}),
-        **({"antialiased": True} if evaluation.options.antialiased else {}),
+        **({"antialiased": True} if all(result.antialiased for result in evaluation.results) else {}),
         **({"lpips_views": num_views} if some_lpips else {}),
         "num_views": dict(evaluation.num_views),
         "results": [_result_entries(result, evaluation, facts.get(result.name, {})) for result in evaluation.results],
@@ -64,6 +64,7 @@ def _result_entries(result: ResultScores, evaluation: Evaluation, facts: Mapping
         "name": result.name,
         **facts,
         "num_gaussians": result.num_gaussians,
+        **({"antialiased": True} if result.antialiased else {}),
         "ratio": result.ratio,
         "render_seconds": round(result.render_seconds, 5),
         **asdict(result.fog.get(ALL, Fog())),

@@ -86,13 +86,15 @@ def measure_fog(
     cameras: Cameras,
     near: float = 0.01,
     progress: Progress = lambda *_: None,
+    marks: Mapping[str, bool] | None = None,
 ) -> dict[str, dict[str, Fog]]:
     """Measure fog, veils, holes and spikes of results, by name, from outside the ``cameras`` of a ``reference`` scene.
 
     Returns, by the name of a result and the kind of camera, a :class:`Fog` of all pictures of this kind. Kinds are the
-    keys of :data:`FOG_CAMERAS`, and "all". ``near`` is the near plane of the pictures, in world units.
+    keys of :data:`FOG_CAMERAS`, and "all". ``near`` is the near plane of the pictures, in world units. ``marks`` says,
+    by name, whether a result is drawn antialiased, if it differs from the ``cameras``.
     """
-    reference_splats = make_splats(reference)
+    reference_splats, marks = make_splats(reference), marks or {}
     splats = {name: make_splats(result) for name, result in results.items()}
     measured: dict[str, list[tuple[str, np.ndarray]]] = {name: [] for name in results}  # camera's kind, sums of pixels
     outside = list(fog_cameras(reference, cameras))
@@ -100,8 +102,9 @@ def measure_fog(
         progress("views from outside", number, len(outside))
         expected = draw_depths(reference_splats, camera, near, FOG_NEAR_PLANE * depth)
         for name in results:
-            sums = sum_pixels(expected, draw_depths(splats[name], camera, near, FOG_NEAR_PLANE * depth))
-            measured[name].append((kind, np.concatenate([sums, count_spikes(results[name], camera, near)])))
+            own_camera = replace(camera, antialiased=marks.get(name, camera.antialiased))
+            sums = sum_pixels(expected, draw_depths(splats[name], own_camera, near, FOG_NEAR_PLANE * depth))
+            measured[name].append((kind, np.concatenate([sums, count_spikes(results[name], own_camera, near)])))
     return {
         name: {
             kind: mean_fog(np.stack([sums for picture_kind, sums in pictures if kind in (picture_kind, ALL)]))
@@ -139,10 +142,8 @@ def draw_depths(splats: Splats, camera: Cameras, near: float, depth_near: float)
 
     Depths are drawn with ``depth_near`` only. Both planes are in world units.
     """
-    views = [
-        tile_view(splats, camera.viewmats[0], camera.Ks[0], camera.width, camera.height, near=plane)
-        for plane in (near, depth_near)
-    ]
+    values = camera.viewmats[0], camera.Ks[0], camera.width, camera.height
+    views = [tile_view(splats, *values, antialiased=camera.antialiased, near=plane) for plane in (near, depth_near)]
     (_, transmittance), (depths, transmittance_beyond) = map(blend_depths, views)
     return OutsidePicture(1 - transmittance, 1 - transmittance_beyond, depths)
 

@@ -31,8 +31,8 @@ class EvaluateOptions(Settings):
     photo_side: int = setting(0, "Longest side, in pixels, to which larger photos and their cameras are resized; the "
         "paper measures at 476.",
         "0: photos keep their size.", least=0, unit="pixels")  # fmt: skip
-    antialiased: bool = setting(False, "Lower the opacity of small Gaussians to offset the low-pass filter, which "
-        "enlarges them, as some viewers do (Mip-Splatting).",
+    antialiased: bool | None = setting(None, "Lower the opacity of small Gaussians to offset the low-pass filter, "
+        "which enlarges them, as some viewers do (Mip-Splatting); null: each file is drawn as its mark says.",
         "See `antialiased` of `gsmerge.render`.")  # fmt: skip
     fog: bool = setting(True, "Also measure fog, veils, holes and spikes of the results. This draws the scene's "
         "Gaussians 24 more times.")  # fmt: skip

@@ -11,6 +11,7 @@ from gsmerge.settings.setting import Settings, setting
 AXES = ("x", "-x", "y", "-y", "z", "-z")
 # Endings of the names of files that ``gsmerge render`` can write
 PICTURES = (".png", ".jpg", ".jpeg", ".webp")
+TRANSPARENT = (".png", ".webp")  # those that hold alpha
 GIF = ".gif"
 CLIPS = (".mp4", ".webm", GIF)
 

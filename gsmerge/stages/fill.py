@@ -136,7 +136,8 @@ def lies_between(known: np.ndarray) -> np.ndarray:
 
 def _tile_camera(splats: Splats, cameras: Cameras, view: int) -> TiledView:
     """Tile the Gaussians for a drawing by one of the cameras."""
-    return tile_view(splats, cameras.viewmats[view], cameras.Ks[view], cameras.width, cameras.height, near=NEAR_PLANE)
+    camera = cameras.viewmats[view], cameras.Ks[view], cameras.width, cameras.height
+    return tile_view(splats, *camera, antialiased=cameras.antialiased, near=NEAR_PLANE)
 
 
 def _draw(splats: Splats, cameras: Cameras, view: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -64,7 +64,8 @@ def _mostly_inside(gaussians: Gaussians, cameras: Cameras, regions: Mapping[int,
     inside, total = np.zeros(len(splats)), np.zeros(len(splats))
     for view, region in regions.items():
         viewmat, K = cameras.viewmats[view].astype(np.float64), cameras.Ks[view].astype(np.float64)
-        tiled = tile_view(splats, viewmat, K, cameras.width, cameras.height, near=NEAR_PLANE)
+        camera = viewmat, K, cameras.width, cameras.height
+        tiled = tile_view(splats, *camera, antialiased=cameras.antialiased, near=NEAR_PLANE)
         image = np.zeros((*region.shape, LANES), np.float32)
         image[..., 0], image[..., 1] = region, 1
         sums = np.zeros((len(tiled.ids), LANES))  # of each Gaussian's weights times the channels of the image

@@ -217,3 +217,13 @@ def test_views_and_backgrounds_that_do_not_fit_are_refused(
     outcome = run("render", small_scene, *flags, "-o", tmp_path / name, code=2)
     assert all(word in outcome.err for word in words)
     assert not (tmp_path / name).exists()
+
+
+def test_pictures_without_a_background_are_transparent(small_scene: Path, tmp_path: Path, run: Run) -> None:
+    run("render", small_scene, "--background", "none", "-o", tmp_path / "all", code=0)
+    run("render", small_scene, "-o", tmp_path / "black", code=0)
+    for path in (tmp_path / "all").iterdir():
+        clear = cv2.imread(str(path), cv2.IMREAD_UNCHANGED).astype(float)
+        black = cv2.imread(str(tmp_path / "black" / path.name)).astype(float)
+        assert clear.shape[-1] == 4
+        assert np.abs(clear[..., :3] * clear[..., 3:] / 255 - black).max() <= 2

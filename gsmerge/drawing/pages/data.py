@@ -45,6 +45,7 @@ class Side:
     covered_share: float | None  # share of the pixels that the input covers, in the views of ``mean``
     covered: Quality  # mean over the covered pixels of these views
     seconds: float  # time to draw a view on this machine, with all threads
+    antialiased: bool  # how its file says that it is drawn, see :func:`gsmerge.render`
     new_gain: tuple[float, float] | None = None  # bounds of the expected gain of new views, dB; None: not known
 
 
@@ -181,7 +182,10 @@ def _fill_page(
     views = _list_views(splits, evaluation, stills, frame, means)
     shown = _choose_shown(views)
     camera, distance = outside_camera(scene.cameras.numpy(), named[INPUT].means)
-    renders = (render(gaussians, camera, near=NEAR_PLANE * frame.unit) for gaussians in named.values())
+    renders = (
+        render(gaussians, camera, antialiased=side.antialiased, near=NEAR_PLANE * frame.unit)
+        for gaussians, side in zip(named.values(), sides, strict=True)
+    )
     outside = PageView(
         name=OUTSIDE_VIEW,
         place=len(views),
@@ -276,6 +280,7 @@ def _collect_side(
         covered_share=covered_share,
         covered=covered,
         seconds=result.render_seconds,
+        antialiased=result.antialiased,
     )
 
 

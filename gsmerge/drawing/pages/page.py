@@ -40,7 +40,8 @@ def view_page(data: ViewData) -> bytes:
     sources: list[dict[str, Any]] = [{"name": picture, "splats": None, "count": 0}] if has_photos else []
     for i, side in enumerate(data.sides):
         splats_id = None if side.splats is None else f"splats-{i}"
-        sources.append({"name": side.name, "splats": splats_id, "count": side.num_gaussians})
+        drawn_as = {"antialiased": True} if side.antialiased else {}
+        sources.append({"name": side.name, "splats": splats_id, "count": side.num_gaussians, **drawn_as})
     right = min(int(has_photos) + 1, len(sources) - 1)  # the first result, with the scene itself to its left
     left = max(right - 1, 0)
     pictures = [(view.photo, *view.stills)[not has_photos :] for view in data.shown]

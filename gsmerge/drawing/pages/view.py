@@ -110,6 +110,8 @@ def view(
         if (expected := getattr(getattr(result, "report", None), "new_views", None)) is not None
     }
     cameras = {
+        name: replace(shown_scene.cameras, antialiased=file.info.antialiased) for name, file in files.items()
+    } | {
         name: replace(shown_scene.cameras, viewmats=moved.numpy().viewmats)
         for name, result in named.items()
         if (moved := getattr(result, "cameras", None)) is not None

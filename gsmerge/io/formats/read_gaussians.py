@@ -13,7 +13,7 @@ from gsmerge.errors import Doubt, Note, SceneError, count_words
 from gsmerge.geometry.transforms import lower_median, rgb_to_sh0
 from gsmerge.io.formats import ply
 from gsmerge.io.formats import rows as arrays
-from gsmerge.io.formats.rows import StoredRows
+from gsmerge.io.formats.rows import MIP, StoredRows, render_mode
 from gsmerge.io.formats.table import META, PLY, READ_ENDINGS, find_format
 from gsmerge.io.formats.units import LINEAR_NOTE, ColorUnits, are_scales_linear, choose_colors, with_linear_scales
 from gsmerge.kernels.elementary import exp
@@ -57,6 +57,11 @@ class FileInfo:
     color_note: str = ""  # sentence without a full stop that says that ``color_units`` were guessed
     open_units: ColorUnits | None = None  # units of RGB that the columns may have if photos confirm it; None: none
     adapted: tuple[str, ...] = ()  # how the content was adapted, one sentence each without a full stop
+
+    @property
+    def antialiased(self) -> bool:
+        """Whether the file says that its Gaussians are drawn antialiased, see :func:`gsmerge.render`."""
+        return render_mode(self.comments) == MIP
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -95,3 +96,21 @@ def test_labels_never_widen_a_tile() -> None:
 
 def test_values_beyond_the_range_are_clamped_in_a_picture() -> None:
     assert preview.to_picture(np.array([[[-1.0, 0.5, 2.0]]], np.float32)).tolist() == [[[0, 128, 255]]]
+
+
+def test_a_chequered_ground_shows_where_nothing_is() -> None:
+    scene = [("one", blob(0.3))]
+    ((_, (_, plain)),) = preview.view_pictures([*scene, *scene], cameras(1))
+    ((_, (_, chequered)),) = preview.view_pictures([*scene, *scene], cameras(1), background=None)
+    assert plain.shape == chequered.shape
+    assert (chequered.astype(int) >= plain.astype(int) - 1).all()  # the ground shines through
+    ground = preview.lay_on_chequer(np.zeros((32, 32, 3), np.float32), np.ones((32, 32), np.float32))
+    assert set(np.unique(preview.to_picture(ground))) == {102, 153}
+    assert (ground[:8, :8] != ground[8:16, :8]).all()
+
+
+def test_a_picture_with_alpha_is_written(tmp_path: Path) -> None:
+    picture = np.zeros((4, 6, 4), np.uint8)
+    picture[1, 2] = 10, 20, 30, 255
+    preview.save_picture(tmp_path / "a.png", picture)
+    assert cv2.imread(str(tmp_path / "a.png"), cv2.IMREAD_UNCHANGED)[1, 2].tolist() == [30, 20, 10, 255]

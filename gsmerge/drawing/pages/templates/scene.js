@@ -81,12 +81,14 @@ class SplatView {
     return this.results.has(source);
   }
 
-  async add(source, fileBytes, fileName = "scene.spz") {
+  async add(source, fileBytes, fileName = "scene.spz", antialiased = false) {
     const mesh = new Vendor.SplatMesh({ fileBytes, fileName });
     await mesh.initialized;
-    // Like gsmerge's own renderer: sorting by depth, a low-pass filter of 0.3 square pixels, no opacities below 1/255
+    // Like gsmerge's own renderer: sorting by depth, a low-pass filter of 0.3 square pixels, no opacities below 1/255.
+    // The filter before the blur keeps opacities; the blur lowers those of small Gaussians, as antialiased viewers do
+    const filter = antialiased ? { preBlurAmount: 0, blurAmount: 0.3 } : { preBlurAmount: 0.3, blurAmount: 0 };
     const spark = new Vendor.SparkRenderer({
-      renderer: this.renderer, autoUpdate: false, sortRadial: false, preBlurAmount: 0.3, blurAmount: 0,
+      renderer: this.renderer, autoUpdate: false, sortRadial: false, ...filter,
       maxStdDev: Math.sqrt(2 * Math.log(255)), minAlpha: 1 / 255, maxPixelRadius: 4096, clipXY: EVERYWHERE, onDirty: () => this.request(),
     });
     if (!spark.material.vertexShader.includes(FOOTPRINT)) throw new Error("another renderer than expected");

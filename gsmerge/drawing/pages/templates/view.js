@@ -228,10 +228,10 @@ function say(words) {
 // Loads the Gaussians that the sides show into 3D; without a GPU, only small scenes.
 async function load(made) {
   for (const source of [state.left, state.right]) {
-    const { splats, count } = data.sources[source];
+    const { splats, count, antialiased } = data.sources[source];
     const drawable = splats && !(made.software && count > SOFTWARE_MOST);
     if (!drawable || made.has(source) || !id(splats)) continue;
-    await made.add(source, await unpackSplats(takeBytes(splats)));
+    await made.add(source, await unpackSplats(takeBytes(splats)), undefined, antialiased);
   }
 }
 

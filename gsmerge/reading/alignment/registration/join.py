@@ -108,6 +108,7 @@ def concat_scenes(scenes: Sequence[Scene], photos: np.ndarray | None = None) -> 
         np.concatenate([scene.cameras.Ks for scene in scenes]),
         scenes[0].cameras.width,
         scenes[0].cameras.height,
+        scenes[0].cameras.antialiased,
     )
     images = [scene.images for scene in scenes if scene.images is not None]
     if photos is None and len(images) == len(scenes):

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import json
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
+import scenes
 from slow_readers import corners
 
+from gsmerge import EvaluateOptions, Gaussians, Scene, compact, evaluate, read_scene, render
 from gsmerge.io import kept_comments, read_gaussians, write_gaussians, write_ply
 from gsmerge.jobs.convert import ConvertOptions, convert_files
 from gsmerge.results.outputs import name_outputs
@@ -18,9 +22,19 @@ from gsmerge.settings.files import PlacementOptions
 def write_marked(path: Path, *comments: str) -> Path:
     """Write a file as of another program, with comments in its header."""
     write_ply(path, corners())
+    return mark(path, *comments)
+
+
+def mark(path: Path, *comments: str) -> Path:
+    """Put comments into the header of a file."""
     head, rows = path.read_bytes().split(b"element vertex", 1)
     more = b"".join(f"comment {comment}\n".encode() for comment in comments)
     path.write_bytes(head + more + b"element vertex" + rows)
+    return path
+
+
+def write(path: Path, gaussians: Gaussians) -> Path:
+    write_ply(path, gaussians)
     return path
 
 
@@ -102,3 +116,37 @@ def test_a_turned_file_has_no_axis_of_the_former_frame(tmp_path: Path) -> None:
         ConvertOptions([path], name_outputs(tmp_path / "turned.ply"), placement=PlacementOptions(rotate="90,0,0"))
     )
     assert read_marks(tmp_path / "turned.ply") == []
+
+
+@pytest.fixture(scope="module")
+def wall() -> Scene:
+    """Small Gaussians, which viewers that draw antialiased show fainter."""
+    scene = scenes.make_scene(scenes.wall(), scenes.arc(2))
+    return replace(scene, gaussians=replace(scene.gaussians, scales=0.3 * scene.gaussians.scales))
+
+
+@pytest.mark.parametrize(("comment", "expected"), [("SplatRenderMode: mip", True), ("antialiased 0", False)])
+def test_a_scene_is_drawn_as_its_file_says(wall: Scene, comment: str, expected: bool, tmp_path: Path) -> None:
+    scene = read_scene(mark(write(tmp_path / "a.ply", wall.gaussians), comment))
+    assert scene.cameras.antialiased is expected
+    result = compact(scene, effort="draft", budget="50%")
+    assert result.cameras.antialiased is expected
+    drawn = {mode: render(wall.gaussians, wall.cameras, antialiased=mode).images for mode in (True, False)}
+    assert np.abs(drawn[True] - drawn[False]).max() > 0.1
+    cameras = replace(wall.cameras, antialiased=expected)
+    np.testing.assert_array_equal(render(wall.gaussians, cameras).images, drawn[expected])
+
+
+def test_files_of_different_marks_are_each_drawn_their_own_way(wall: Scene) -> None:
+    scene = replace(wall, images=render(wall.gaussians, wall.cameras).images.clip(0, 1))
+    marked = {"marked": replace(scene.cameras, antialiased=True)}
+    options = EvaluateOptions(lpips=(), fog=False)
+    results = {"plain": scene.gaussians, "marked": scene.gaussians}
+    scores = evaluate(scene, results, None, options, cameras=marked).results
+    assert [one.antialiased for one in scores] == [False, False, True]
+    original, plain, other = (one.mean("context")[0].psnr for one in scores)
+    assert original == plain
+    assert other is not None
+    assert other < 60
+    both = evaluate(scene, results, None, replace(options, antialiased=True), cameras=marked).results
+    assert len({one.mean("context")[0].psnr for one in both}) == 1
