@@ -75,6 +75,8 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = Fa
         covered = transmittance <= 1 - HOLE_OPACITY
         if is_cropped or not everywhere:
             empty[view] = _find_empty(1 - transmittance, shown[view], gap, is_cropped=is_cropped)
+        if scene.importance is not None:  # nothing is known about what lies beyond a photo
+            empty[view] &= scene.importance[view] > 0
         bare[view] = ~covered & ~empty[view]
         holes[view] = fillable[view] & bare[view]
         if empty[view].any():  # the edges of a scene that was cut out are no holes
@@ -164,10 +166,11 @@ def _leave_empty(scene: PicturedScene, empty: np.ndarray) -> PicturedScene:
         )
     images = np.where(empty[..., None], np.float32(0), scene.images)
     masks, large = ~empty if scene.masks is None else scene.masks & ~empty, scene.large_photos
+    shares = empty.astype(np.float32) if scene.empty is None else np.maximum(scene.empty, empty)
     if large is not None:
         black = np.zeros((*empty.shape[1:], 3), np.float32)
         large = change_large(large, [PhotoChange(cover=mask, colors=black) for mask in empty])
-    return replace(scene, images=images, masks=masks, large_photos=large, empty=empty)
+    return replace(scene, images=images, masks=masks, large_photos=large, empty=shares)
 
 
 def _fill_view(scene: PicturedScene, view: int, holes: np.ndarray, edges: _Edges) -> Gaussians:

@@ -12,6 +12,7 @@ from gsmerge.geometry.frame import Frame, canonicalise, sample_rows
 from gsmerge.geometry.views import camera_kinds, subset
 from gsmerge.prepare.compare_photos import compare_photos
 from gsmerge.prepare.confirm_depths import Agreement, confirm_depths
+from gsmerge.prepare.draw_left_out import draw_left_out, mask_background
 from gsmerge.prepare.draw_outside import draw_outside
 from gsmerge.prepare.exposure import equalise_exposure
 from gsmerge.prepare.fill_holes import fill_holes
@@ -163,10 +164,12 @@ def prepare(
         if agreement.advice:
             note(agreement.advice)
     if fill and reference.of_views:
-        views, shown = reference.score_views, np.zeros(scene.images.shape[:3], bool)
+        if reference.name == PHOTOS and options.extent != "photos":
+            scene = mask_background(scene)
+        views, shown, masks = reference.score_views, np.zeros(scene.images.shape[:3], bool), scene.masks
         has_row_colors = reference.name == ROW_COLORS  # these pictures have colours at all pixels
-        shown[list(views)] = True if has_row_colors or scene.masks is None else scene.masks[list(views)]
-        scene = fill_holes(scene, shown, everywhere=options.extent == "photos")
+        shown[list(views)] = True if has_row_colors or masks is None else masks[list(views)]
+        scene = draw_left_out(fill_holes(scene, shown, everywhere=options.extent == "photos"), masks)
         if scene.empty is not None and scene.masks is not None:  # views that count nowhere any more are not scored
             seen = tuple(view for view in views if scene.masks[view].any())
             reference = replace(reference, score_views=seen or views)

@@ -425,7 +425,7 @@ def _add_larger_and_masks(load: Loaded) -> Loaded:
         notes.append(Doubt(f"masks are left out: {error.path}: {error.problem}; {remedy}"))
         without_masks = replace(files, masks=None, named=files.named | {"masks"})
         large, masks, mask_notes = find_larger_and_masks(without_masks, source, scene.cameras)
-    masks, check_notes = check_masks(masks, files, scene.pixels)
+    masks, check_notes = check_masks(masks, files, scene)
     counts = masks.counts
     if scene.masks is not None:  # some views have no photo, and none of their pixels count
         counts = scene.masks if counts is None else counts & scene.masks

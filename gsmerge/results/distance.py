@@ -6,6 +6,8 @@ itself a larger error than the input, by the triangle inequality. This test find
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from gsmerge.fit.outside import outside_cameras, sample_gaussians
@@ -17,7 +19,7 @@ from gsmerge.raster import render
 from gsmerge.raster.metrics import decibels
 from gsmerge.raster.photos import shrink_pictures
 from gsmerge.runtime.record import stage
-from gsmerge.types import Cameras, Gaussians
+from gsmerge.types import Cameras, Gaussians, PicturedScene
 
 WRONG_DB = 20.0  # PSNR below which pictures look wrong; errors are then a tenth of the range of colours
 TWICE_DB = decibels(1 / 4)  # dB between two errors of which one is twice the other (root mean square)
@@ -40,7 +42,7 @@ def is_clearly_worse(input_psnr: float | None, result_psnr: float | None) -> boo
 
 @stage("input")
 def describe_clear_loss(gaussians: Gaussians, prepared: Prepared) -> str | None:
-    """Say that a result is clearly worse than its input in pictures between the views; None if it is not worse.
+    """Say that a result is clearly worse than its input between the views or in left-out pixels; None if it is not.
 
     ``gaussians`` are the canonical Gaussians of the result. The scene has photos.
     """
@@ -54,6 +56,12 @@ def describe_clear_loss(gaussians: Gaussians, prepared: Prepared) -> str | None:
         between = between[even_views(len(between), min(len(between), MOST_BETWEEN))]
     else:  # all views have the same place, so the cameras are placed beside them
         between = outside_cameras(sample.means, cameras, MOST_BETWEEN, OUTSIDE_LOW, OUTSIDE_HIGH)
+    input_psnr, psnr = (_measure_left_out(one, scene, cameras, photo_views) for one in (sample, gaussians))
+    if is_clearly_worse(input_psnr, psnr):
+        return (
+            "where photos do not count, the result differs from what belongs there more than twice as much as the input"
+            f" does: {psnr:.1f} dB, {input_psnr:.1f} dB"
+        )
     psnr_to_input = _measure_psnr(sample, between, render(gaussians, between).images, None)
     if not psnr_to_input < WRONG_DB:  # most results look right, so the photos need not be read
         return None
@@ -66,6 +74,29 @@ def describe_clear_loss(gaussians: Gaussians, prepared: Prepared) -> str | None:
         "between the views, pictures of the result differ from pictures of the input more than twice as much as these"
         f" differ from the photos: {psnr_to_input:.1f} dB, {input_psnr:.1f} dB"
     )
+
+
+def _measure_left_out(
+    gaussians: Gaussians, scene: PicturedScene, cameras: Cameras, views: Sequence[int]
+) -> float | None:
+    """Return the PSNR (dB) of renders, over black or white, in pixels that masks leave out; None without such pixels.
+
+    The lower of the two PSNR is returned, because a halo in the colour of the background does not show over it.
+    """
+    if scene.empty is None or scene.masks is None:
+        return None
+    size = cameras.width, cameras.height
+    left_out_pixels = ~scene.masks[views]
+    if scene.importance is not None:  # nothing is known about what lies beyond a photo
+        left_out_pixels &= scene.importance[views] > 0
+    left_out = shrink_pictures(left_out_pixels.astype(np.float32), *size) == 1
+    if not left_out.any():
+        return None
+    pictures, empty = shrink_pictures(scene.images[views], *size), shrink_pictures(scene.empty[views], *size)
+    drawn = render(gaussians, cameras[views])
+    errors = (drawn.images - pictures)[left_out]
+    on_white = errors + (1 - drawn.alphas - empty[..., None])[left_out]
+    return decibels(float(max((errors**2).mean(), (on_white**2).mean())))
 
 
 def _measure_psnr(gaussians: Gaussians, cameras: Cameras, pictures: np.ndarray, masks: np.ndarray | None) -> float:

@@ -74,7 +74,7 @@ def segment_scene(scene: PicturedScene, choices: SuperpixelChoices, count: int |
     pixels differ in importance are always cut from the tree. If the shared tree is too coarse, a finer tree is built.
     """
     limits, options, num_views = choices.limits, choices.options, len(scene)
-    if count is None and scene.importance is not None:
+    if count is None and scene.protected is not None:
         count = limits.default
     if count is None:
         start_per_view = max(1, int(limits.per_view * choices.start_share))
@@ -90,12 +90,12 @@ def segment_scene(scene: PicturedScene, choices: SuperpixelChoices, count: int |
 def scene_tree(scene: PicturedScene, options: SegmentOptions, limits: CountLimits, count: int) -> RegionTree:
     """Build the region tree of a scene from enough superpixels for ``count`` Gaussians.
 
-    The squared colour error of a pixel is multiplied by its importance. For this, colours are multiplied by the square
-    root of the importance.
+    The squared colour error of a pixel is multiplied by its importance if that is above 1. For this, colours are
+    multiplied by the square root of the importance.
     """
     images, per_view = scene.images, max(limits.per_view, -(-count // len(scene)))
-    if scene.importance is not None:
-        images = images * np.sqrt(scene.importance)[..., None]
+    if scene.importance is not None and scene.protected is not None:
+        images = images * np.sqrt(np.maximum(scene.importance, 1))[..., None]
         per_view = int(per_view * scene.importance.max())  # important pixels need more superpixels
     groups = segment(scene.images, options, min(per_view, scene.pixels_per_view))
     return region_tree(images, front_depths(scene), groups, scene.get_pixels().shown)

@@ -242,7 +242,7 @@ def test_an_input_with_holes_is_compared_where_it_has_gaussians(scene: Scene) ->
     """Elsewhere a worse result would be called better."""
     rows = unaligned_scenes.without_order(scene, np.arange(0, len(scene.gaussians), 2))
     x = rows.gaussians.means[:, 0]
-    rows = replace(rows, gaussians=rows.gaussians[np.flatnonzero(x < np.quantile(x, 0.7))])
+    rows = replace(rows, gaussians=rows.gaussians[np.flatnonzero(x < np.quantile(x, 0.9))])
     prepared = prepare(rows, options_of().prepare)
     plan = add_target(plan_of(rows), prepared)
     assert plan.before is not None

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from gsmerge.errors import Doubt, SceneError
+from gsmerge.geometry.transforms import is_inside, project
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.image_names import find_image, match_masks
 from gsmerge.io.photo_files import (
@@ -31,7 +32,7 @@ from gsmerge.reading.scene_files import SceneFiles
 from gsmerge.runtime.record import list_some
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.reading import NONE
-from gsmerge.types import PROTECTED, Cameras, Pixels, StrPath
+from gsmerge.types import PROTECTED, Cameras, Scene, StrPath
 
 _WHITE = np.uint8(255)
 
@@ -66,7 +67,8 @@ class MaskFiles:
 
     def read(self, view: int) -> tuple[np.ndarray | None, np.ndarray | None]:
         """Read which pixels ``[h,w]`` of a view count, and their weights ``[h,w]``; None: all count, with weight 1."""
-        photo, counts, importance = self.photos[view] if self.photos else None, None, None
+        photo, counts = self.photos[view] if self.photos else None, None
+        importance: np.ndarray | None = None
         alpha = None if photo is None else decode_alpha(photo)
         min_level = 191  # level of 255; a pixel counts if three quarters of the file's pixels in it count
         if alpha is not None:
@@ -78,7 +80,8 @@ class MaskFiles:
             light = self._reduce(is_light * _WHITE, view)
             counts = (light > min_level) if counts is None else counts & (light > min_level)
             if (levels[is_light] < _WHITE).any():  # grey means a lower weight: the mean over the pixels that count
-                importance = self._reduce(levels * is_light, view) / np.maximum(light, np.float32(1))
+                shares = self._reduce(levels * is_light, view) / np.maximum(light, np.float32(1))
+                importance = np.where(light > 0, shares, np.float32(1))
         if (mask := self.protecting[view]) is not None:
             share = self._reduce(self._read_levels(mask, view), view) / np.float32(_WHITE)
             importance = (1 if importance is None else importance) * (1 + (PROTECTED - 1) * share)
@@ -239,28 +242,46 @@ def _describe_protected(importance: np.ndarray | None, masks: Sequence[Path | No
     return f"protect: {share:.1f} % of the photos' pixels have {weight}, by the pictures of {photos}"
 
 
-def check_masks(masks: Masks, files: SceneFiles, pixels: Pixels | None) -> tuple[Masks, list[str]]:
+def check_masks(masks: Masks, files: SceneFiles, scene: Scene) -> tuple[Masks, list[str]]:
     """Return the masks that are used, and notes on the share of the photos that masks leave out.
 
-    Masks that leave out nearly everything are not used, and raise a SceneError if the user named them. If masks that
-    the user did not name leave out most pixels that show Gaussians, the note is a doubt, since the masks may be
-    inverted.
+    Masks that leave out nearly everything, or most of what the Gaussians show, are not used, unless the user named
+    them: a photo's alpha may be a confidence or a depth, and masks may be inverted. Named masks that leave out nearly
+    everything raise a SceneError.
     """
     counts = masks.counts
     if counts is None:
         return masks, []
     share = float(1 - counts.mean())  # share of the pixels that masks leave out
     max_share = 0.98  # masks that leave out more are not used
-    if share < max_share:
-        count = int((~counts.all((1, 2))).sum())
-        note = f"masks leave out {100 * share:.0f} % of the photos' pixels; {count} of {len(counts)} photos have a mask"
-        shown = None if pixels is None or "masks" in files.named or files.masks is None else pixels.shown
-        if shown is None or 2 * (counts & shown).sum() >= shown.sum():
-            return masks, [note]
-        remedy = f"if they are right, pass --masks {files.masks}; otherwise invert them, or pass --masks {NONE}"
-        return masks, [Doubt(f"{note}: most of what the Gaussians show; {remedy}")]
-    problem = f"expected masks that are bright where photos count, found {100 * share:.0f} % of their pixels dark"
-    if "masks" not in files.named or files.masks is None:
-        where = files.masks or "transparency, or masks that the cameras' file names"
+    is_named = "masks" in files.named and files.masks is not None
+    where = files.masks or "transparency, or masks that the cameras' file names"
+    if share >= max_share:
+        problem = f"expected masks that are bright where photos count, found {100 * share:.0f} % of their pixels dark"
+        if is_named:
+            raise SceneError(where, problem, "invert them, or name another folder with --masks")
         return NO_MASKS, [Doubt(f"masks are not used: {where}: {problem}; name them with --masks")]
-    raise SceneError(files.masks, problem, "invert them, or name another folder with --masks")
+    if not is_named and 2 * _share_of_gaussians(scene, counts) < 1:
+        problem = f"they leave out {100 * share:.0f} % of the photos' pixels, and most of what the Gaussians show"
+        remedy = f"if they are right, name masks with --masks; otherwise pass --masks {NONE}"
+        return NO_MASKS, [Doubt(f"masks are not used: {where}: {problem}; {remedy}")]
+    count = int((~counts.all((1, 2))).sum())
+    return masks, [
+        f"masks leave out {100 * share:.0f} % of the photos' pixels; {count} of {len(counts)} photos have a mask"
+    ]
+
+
+def _share_of_gaussians(scene: Scene, counts: np.ndarray) -> float:
+    """Return the share of what the Gaussians show in the views that lies at pixels that count, ``counts [v,h,w]``.
+
+    These are the pixels with Gaussians of their own, or the centres of Gaussians that views share.
+    """
+    if scene.pixels is not None:
+        shown = scene.pixels.shown
+        return float((counts & shown).sum() / max(1, int(shown.sum())))
+    sample = 1 << 14  # Gaussians whose centres are looked up
+    means = scene.gaussians.means[:: 1 + len(scene.gaussians) // sample]
+    pixels, depths = project(means, scene.cameras)
+    views, rows = np.nonzero(is_inside(pixels, scene.cameras) & (depths > 0))
+    columns, lines = pixels[views, rows].astype(int).T
+    return float(counts[views, lines, columns].mean()) if len(views) else 1.0

@@ -244,7 +244,7 @@ def test_photo_among_masks_keeps_the_masks_from_use(tiny_folder: Path, tiny: Tin
 
 
 @pytest.mark.parametrize("is_inverted", [False, True])
-def test_found_masks_that_hide_most_of_the_scene_are_doubted(tmp_path: Path, is_inverted: bool) -> None:
+def test_found_masks_that_hide_most_of_the_scene_are_none(tmp_path: Path, is_inverted: bool) -> None:
     scene = smooth_scene(56, 40)
     folder = save_export(tmp_path / "scene", scene, export_rows(scene))
     mask = np.full((40, 56), 255, np.uint8)
@@ -252,9 +252,37 @@ def test_found_masks_that_hide_most_of_the_scene_are_doubted(tmp_path: Path, is_
     for name in scene.names:
         write(folder / "masks" / name, 255 - mask if is_inverted else mask)
     load = load_scene(folder)
-    assert load.scene.masks is not None
-    assert [names(doubt, "masks leave out 79 %", "--masks none") for doubt in load.doubts] == [True] * is_inverted
-    assert not load_scene(folder, masks=folder / "masks").doubts
+    assert (load.scene.masks is None) == is_inverted
+    assert [names(doubt, "leave out 79 %", "--masks none") for doubt in load.doubts] == [True] * is_inverted
+    named = load_scene(folder, masks=folder / "masks")
+    assert named.scene.masks is not None
+    assert not named.doubts
+
+
+def test_an_alpha_that_hides_most_of_what_gaussians_show_is_none(tmp_path: Path) -> None:
+    """A confidence, say, here of a scene whose rows are no pixels."""
+    scene = smooth_scene(56, 40)
+    rows = export_rows(scene)
+    folder = save_export(tmp_path / "scene", scene, rows[np.random.default_rng(0).permutation(len(rows))])
+    confidence = np.full((40, 56), 90, np.uint8)
+    confidence[15:25, 20:30] = 255
+    for name in scene.names:
+        path = folder / "images" / name
+        write(path, np.dstack([cv2.imread(str(path)), confidence]))
+    load = load_scene(folder)
+    assert load.scene.masks is None
+    assert names(str(load.doubts), "masks are not used: transparency", "most of what the Gaussians show")
+
+
+def test_grey_edges_of_a_mask_change_no_dark_pixel(tiny_folder: Path, tiny: Tiny) -> None:
+    soft = np.where(half(tiny), 255, 0).astype(np.uint8)
+    soft[:, tiny.width // 2 - 1] = 200
+    write(tiny_folder / "masks" / tiny.names[0], soft)
+    importance = load_scene(tiny_folder).scene.importance
+    assert importance is not None
+    assert (importance[0, :, : tiny.width // 2 - 1] == 1).all()
+    assert (importance[0, :, tiny.width // 2 :] == 1).all()  # where the mask is dark; there photos do not count anyway
+    assert (importance[0, :, tiny.width // 2 - 1] < 1).all()
 
 
 @pytest.mark.parametrize("ending", [".png", ".jpg"])

@@ -1,0 +1,99 @@
+"""Scene -> the scene whose pictures show the input itself, with its opacity, in pixels where photos do not count.
+
+Masks, transparency and uniform backgrounds leave out pixels. What the input shows decides what a result should show
+there: its own picture or, where it shows nothing, emptiness, over which a fit draws several backgrounds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from gsmerge.prepare.fill_holes import BARE, large_parts
+from gsmerge.prepare.photo_change import PhotoChange, change_large
+from gsmerge.raster import render
+from gsmerge.raster.photos import COVERED_TRANSMITTANCE
+from gsmerge.runtime.record import note
+from gsmerge.types import PicturedScene
+
+# All radii are in widths of a Gaussian, see measure_unit. Left-out pixels are empty in holes of the input of at least
+# the radius HOLE, and in the rim RIM around these holes, where Gaussians of an object reach over its edge. Beside a
+# large empty part that no mask leaves out, pixels without Gaussians are empty up to REACH, and photos do not count in
+# the next RING pixels
+HOLE, RIM, REACH, RING = 3, 2, 8, 3
+SOFT = 1  # width of the edge between a uniform background and an object, where the photo mixes both
+NOISE = np.float32(16 / 255)  # largest difference between the colour of a uniform background and a pixel of it
+MOST_OTHER = 0.05  # largest share of the pixels of a uniform background that differ more
+
+
+def mask_background(scene: PicturedScene) -> PicturedScene:
+    """Leave out the uniform background of photos of an object, which is where the input shows nothing."""
+    fronts, counts = scene.get_pixels().fronts, _counting(scene)
+    bare, num_views = (fronts < 0) | (scene.gaussians.opacities[fronts] <= BARE), 0
+    unit = measure_unit(scene)
+    for view, photo in enumerate(scene.images):
+        part = large_parts(bare[view]) & counts[view]
+        if not part.any():
+            continue
+        differs = np.abs(photo - np.median(photo[part], 0)).max(-1) > NOISE
+        if differs[part].mean() <= MOST_OTHER:
+            alpha = render(scene.gaussians, scene.cameras[[view]]).alphas[0, ..., 0]
+            counts[view] &= ~_grow(~differs & _grow(1 - alpha > COVERED_TRANSMITTANCE, RIM * unit), SOFT * unit)
+            num_views += 1
+    if not num_views:
+        return scene
+    note(f"{num_views} of {len(scene)} photos show one colour where the scene shows nothing; it counts as transparent")
+    return replace(scene, masks=counts)
+
+
+def draw_left_out(scene: PicturedScene, masks: np.ndarray | None) -> PicturedScene:
+    """Return a scene whose pictures, where they do not count, show the input, or nothing where the input shows nothing.
+
+    ``masks`` are the masks of the photos, before :func:`fill_holes` left out large empty parts.
+    """
+    counts = _counting(scene)
+    if counts.all() or scene.region is not None:  # a cropped scene is empty beyond its region
+        return scene
+    unit, holes = measure_unit(scene), np.zeros(counts.shape, bool) if scene.empty is None else scene.empty > 0
+    drawn = render(scene.gaussians, scene.cameras)
+    colors, transmittance = drawn.images.clip(0, 1), 1 - drawn.alphas[..., 0]
+    bare = transmittance > COVERED_TRANSMITTANCE
+    if scene.importance is not None:  # nothing is known about what lies beyond a photo
+        bare &= scene.importance > 0
+    if scene.has_own_pixels:  # pictures already have the colours of the views' own Gaussians, which are solid
+        colors, transmittance = scene.images.copy(), np.zeros_like(transmittance)
+    for view, hole in enumerate(holes):
+        left_out = np.zeros(hole.shape, bool) if masks is None else ~masks[view]
+        nothing = _grow(~_grow(~bare[view], HOLE * unit), HOLE * unit)
+        cut = (hole | (nothing & _grow(hole, REACH * unit))) & ~left_out
+        counts[view] &= ~_grow(cut, RING * unit)
+        left_out |= cut
+        is_empty = (hole | _grow(nothing & left_out, RIM * unit)) & left_out
+        colors[view][is_empty], transmittance[view][is_empty] = 0, 1
+    changes = [PhotoChange(cover=~counting, colors=picture) for counting, picture in zip(counts, colors, strict=True)]
+    images = np.stack([change(photo) for change, photo in zip(changes, scene.images, strict=True)])
+    large = None if scene.large_photos is None else change_large(scene.large_photos, changes)
+    return replace(scene, images=images, masks=counts, large_photos=large, empty=np.where(counts, 0, transmittance))
+
+
+def _counting(scene: PicturedScene) -> np.ndarray:
+    """Return a copy of the masks ``[v,h,w]``, all True without masks."""
+    return np.full(scene.images.shape[:3], True) if scene.masks is None else scene.masks.copy()
+
+
+def measure_unit(scene: PicturedScene) -> float:
+    """Return how many pixels wide a Gaussian is in the views, if all pixels that show some were shared out; at least 1.
+
+    Views may have far more pixels than a model made Gaussians from.
+    """
+    return max(1.0, float(np.sqrt(scene.get_pixels().shown.sum() / len(scene.gaussians))))
+
+
+def _grow(mask: np.ndarray, radius: float) -> np.ndarray:
+    """Grow a mask ``[h,w]`` by ``radius`` pixels."""
+    if not mask.any():
+        return mask
+    distances = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return np.asarray(distances <= radius)

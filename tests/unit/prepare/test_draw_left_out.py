@@ -1,0 +1,83 @@
+"""Pixels that no photo shows keep what the input shows, or stay empty where it shows nothing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scenes
+
+from gsmerge import Gaussians, Scene, compact, render
+from gsmerge.prepare.prepare_scene import prepare
+from gsmerge.raster.metrics import decibels
+
+WIDTH, HEIGHT = 96, 72
+FIT = {"superpixels": 200, "fit_steps": 60, "checkpoint": "none", "poses": "fixed", "new_views": False}
+
+
+@pytest.fixture(scope="module")
+def room() -> Scene:
+    return scenes.make_scene(scenes.room(), scenes.arc(4, WIDTH, HEIGHT))
+
+
+@pytest.fixture(scope="module")
+def ball(room: Scene) -> Scene:
+    """The Gaussians of the ball without pixels, beside photos of the ball before nothing."""
+    near = np.linalg.norm(room.gaussians.means - np.array([0.2, 0.1, 2.6]), axis=1) < 0.55
+    gaussians = room.gaussians[np.flatnonzero(near)]
+    drawn = render(gaussians, room.cameras)
+    return replace(room, gaussians=gaussians, pixels=None, images=drawn.images.clip(0, 1))
+
+
+def over_both(gaussians: Gaussians, truth: Scene) -> float:
+    """Return the lower PSNR (dB) of renders over black and over white, against the truth's own Gaussians."""
+    actual, expected = (render(one, truth.cameras) for one in (gaussians, truth.gaussians))
+    errors = [
+        actual.images + level * (1 - actual.alphas) - expected.images - level * (1 - expected.alphas)
+        for level in (0.0, 1.0)
+    ]
+    return min(decibels(float(np.square(error).mean())) for error in errors)
+
+
+@pytest.mark.parametrize("color", [(1.0, 1.0, 1.0), (0.0, 0.0, 0.0), (0.2, 0.7, 0.3)], ids=["white", "black", "green"])
+def test_a_uniform_background_is_no_surface(ball: Scene, color: tuple[float, float, float]) -> None:
+    alphas = render(ball.gaussians, ball.cameras).alphas
+    scene = replace(ball, images=ball.images + (1 - alphas) * np.float32(color))
+    result = compact(scene, **FIT)
+    assert any("one colour where the scene shows nothing" in note for note in result.report.notes)
+    beside = alphas[..., 0] < 0.02
+    assert render(result.gaussians, ball.cameras).alphas[..., 0][beside].mean() < 0.02
+    assert over_both(result.gaussians, ball) > 22
+
+
+def test_a_background_with_content_is_one(ball: Scene, room: Scene) -> None:
+    notes = compact(replace(ball, images=room.images), **FIT).report.notes
+    assert not any("one colour" in note for note in notes)
+
+
+def test_what_masks_leave_out_keeps_what_the_input_shows(room: Scene) -> None:
+    """Whether the masks are hard or soft, and whether the rows are pixels or not."""
+    masks = np.full((4, HEIGHT, WIDTH), True)
+    masks[:, :20] = False
+    importance = np.ones(masks.shape, np.float32)
+    importance[:, 20] = 0.4
+    shared = replace(room, pixels=None)
+    for scene in (room, shared):
+        psnrs = [
+            scenes.psnr_of(compact(replace(scene, masks=masks, importance=weights), **FIT).gaussians, room)
+            for weights in (None, importance)
+        ]
+        assert min(psnrs) > scenes.psnr_of(compact(scene, **FIT).gaussians, room) - 2.5
+
+
+def test_shares_of_emptiness_are_the_transmittance_of_the_input(room: Scene) -> None:
+    faint = replace(room, gaussians=replace(room.gaussians, opacities=0.3 * room.gaussians.opacities), pixels=None)
+    masks = np.full((4, HEIGHT, WIDTH), True)
+    masks[:, :, :30] = False
+    prepared = prepare(replace(faint, masks=masks)).scene
+    assert prepared.empty is not None
+    inner = np.s_[:, 10:-10, 5:25]
+    expected = 1 - render(prepared.gaussians, prepared.cameras).alphas[..., 0]
+    np.testing.assert_allclose(prepared.empty[inner], expected[inner], atol=1e-6)
+    assert (prepared.empty[:, :, 31:] == 0).all()
