@@ -115,9 +115,11 @@ def decode_photos(
     size: Size,
     part: Part = WHOLE,
     damaged: dict[Path, str] | None = None,
+    canvas: Size | None = None,
 ) -> PhotoArrays:
     """Decode the photo of each view, turn it upright, and resize a ``part`` of it to ``[h,w,3]`` uint8 of one ``size``.
 
+    If there is a ``canvas``, photos are extended to it first, see :func:`extend_picture`.
     ``turns`` are those of :func:`orientation_turn`. A view without a file gets a black photo. If all photos together
     are large, they are decoded at each use. Otherwise each photo is decoded once, even if several views have the same
     photo. Raise SceneError as in :func:`decode_images`; but if ``damaged`` is given, a photo that cannot be decoded is
@@ -144,7 +146,9 @@ def decode_photos(
                 raise
             damaged[path] = error.problem
             return np.zeros((size[1], size[0], 3), np.uint8)
-        photo = np.ascontiguousarray(cut_part(turn_picture(whole, turn), part))
+        upright = turn_picture(whole, turn)
+        upright = extend_picture(upright, upright.shape[1::-1], canvas)
+        photo = np.ascontiguousarray(cut_part(upright, part))
         photo_size = photo.shape[1], photo.shape[0]
         return photo if photo_size == size else resize_to(photo_size, size).photos([photo])[0]
 
@@ -154,6 +158,19 @@ def decode_photos(
         return PhotoReader(len(views), size, lambda view: decode(views[view]))
     decoded = dict(zip(different, parallel_map(decode, different), strict=True))
     return [decoded[view] for view in views]
+
+
+def extend_picture(picture: np.ndarray, size: Size, canvas: Size | None) -> np.ndarray:
+    """Extend a picture ``[h,w,...]`` of a photo of ``size`` by zeros, to the right and below.
+
+    The whole picture is to the photo as the result is to the ``canvas``. Without a canvas, return the picture itself.
+    """
+    if canvas is None or canvas == size:
+        return picture
+    width, height = (round(side * new / old) for side, new, old in zip(picture.shape[1::-1], canvas, size, strict=True))
+    out = np.zeros((max(height, len(picture)), max(width, picture.shape[1]), *picture.shape[2:]), picture.dtype)
+    out[: len(picture), : picture.shape[1]] = picture
+    return out
 
 
 def decode_small(path: Path, side: int) -> np.ndarray:

@@ -73,7 +73,7 @@ class RowSource:
     def inputs(self, grid: Grid, *, photos: bool = True) -> AlignmentInput:
         """Return rows, cameras and photos at the size of a grid; without photos if ``photos`` is False."""
         images = NO_IMAGES
-        if photos:
+        if photos and not grid.previews:
             images = self.images if grid.transform is None else as_floats(grid.transform.photos(self.photos))
         return AlignmentInput(self.ply.gaussians, self.ply.valid, grid.cameras, images, self.scale)
 
@@ -147,7 +147,8 @@ def align(
             pixels of other cameras.
     """
     camera_file = with_sizes(camera_file, photo_size(photos))
-    source, grids = RowSource(ply, camera_file, photos, order, scale), list_grids(camera_file, photo_size(photos))
+    source = RowSource(ply, camera_file, photos, order, scale)
+    grids = list_grids(camera_file, photo_size(photos), len(ply.gaussians))
     for grid in grids:
         recovery = _recover_pixels(source, grid)
         if recovery is not None:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,7 @@ class Grid:
     camera_file: CameraFile  # the cameras as they are read, in one convention of the poses
     cameras: Cameras  # the same cameras at the size of the grid, in their own world
     transform: PhotoTransform | None  # transform of the photos to the grid; None: photos stay as they are
+    previews: bool = field(default=False, kw_only=True)  # the photos are much smaller than the grid, and are not used
     remarks: tuple[str, ...]  # notes for the user on this size, one sentence each
     moves: Sequence[dict[str, Any]] = ()  # how far each camera was moved to its Gaussians; empty if none was moved
     # ``[c,4,4]`` poses as read, if photos confirm them, so that the Gaussians have to move instead; otherwise None
@@ -90,16 +92,18 @@ def with_sizes(camera_file: CameraFile, size: Size | None) -> CameraFile:
     return replace(camera_file, widths=widths, heights=heights)
 
 
-def list_grids(camera_file: CameraFile, size: Size | None) -> list[Grid]:
-    """List the grids whose pixels the rows of a file may be, the likeliest first.
+def list_grids(camera_file: CameraFile, size: Size | None, num_rows: int) -> list[Grid]:
+    """List the grids whose pixels the ``num_rows`` rows of a file may be, the likeliest first.
 
     ``size`` is that of the photos; None without photos. The grids are
 
     1. the grid to which the program that wrote the cameras resizes and crops photos, if that is known;
     2. the photos, with cameras at their size, or without photos the cameras at their own size;
-    3. the cameras at their own size, with photos resized to it, unless they are previews that would be enlarged too
-       much;
-    4. the photos, with cameras cropped to their shape, if photos and cameras differ in shape.
+    3. the cameras at their own size, with photos resized to it;
+    4. the photos, with cameras cropped to their shape, if photos and cameras differ in shape;
+    5. a multiple of the photos' size that has as many pixels as there are rows.
+
+    Photos that would be enlarged too much are previews, which are not used, as a fit to them would blur the Gaussians.
 
     Raises SceneError if photos and cameras differ in shape, and the cameras have several sizes.
     """
@@ -123,10 +127,16 @@ def list_grids(camera_file: CameraFile, size: Size | None) -> list[Grid]:
             crop = resize_and_crop(camera_size, size)
             remark = f"cameras of {camera_size[0]} x {camera_size[1]} are {crop.description}, the images' size"
             grids.append(Grid(camera_file, crop.cameras(cameras), None, (remark,)))
-        elif max(transform.scale_x, transform.scale_y) <= max_enlarged:  # a fit to previews would blur the Gaussians
+        elif max(transform.scale_x, transform.scale_y) > max_enlarged:
+            grids.append(_preview_grid(camera_file, size, camera_size))
+        else:
             remark = f"photos of {width} x {height} are {transform.description}"
             remark += ", the cameras' and the Gaussian grid's size"
             grids.append(Grid(camera_file, cameras, transform, (remark,)))
+    elif stored == [size]:
+        times = math.isqrt(num_rows // (len(camera_file) * width * height))
+        if times > 1:
+            grids.append(_preview_grid(camera_file, size, (times * width, times * height)))
     if mismatch is not None:
         found = "{} x {}".format(*mismatch)
         problem = f"expected cameras of the images' size {width} x {height} or a multiple of it, found {found}"
@@ -137,6 +147,13 @@ def list_grids(camera_file: CameraFile, size: Size | None) -> list[Grid]:
             raise error
         grids = [replace(grid, mismatch=error) for grid in grids]
     return grids
+
+
+def _preview_grid(camera_file: CameraFile, size: Size, grid_size: Size) -> Grid:
+    """Return a grid without photos, because those of ``size`` are much smaller than the grid."""
+    remark = "photos of {} x {} are much smaller than the Gaussian grid of {} x {}, so Gaussians keep their own colours"
+    remarks = (remark.format(*size, *grid_size),)
+    return Grid(camera_file, to_cameras(camera_file, grid_size), None, remarks, previews=True)
 
 
 def _mapped_grid(camera_file: CameraFile, size: Size, file_size: Size, file_transform: PhotoTransform) -> Grid:

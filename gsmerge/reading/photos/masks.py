@@ -21,6 +21,7 @@ from gsmerge.io.photo_files import (
     decode_alpha,
     decode_levels,
     decode_small,
+    extend_picture,
     image_size,
     limit_size,
     same_shape,
@@ -61,6 +62,7 @@ class MaskFiles:
     masks: Sequence[Path | None]  # dark where a photo does not count
     protecting: Sequence[Path | None]  # white where a photo counts more
     part: Part  # the part of each upright photo that is used
+    canvas: Size | None  # size to which upright photos are extended; what is added does not count
     stored: Size  # size of this part
     cut: Callable[[int, np.ndarray], np.ndarray]  # view, picture of the size ``stored`` -> what the view shows of it
     cameras: Cameras
@@ -71,8 +73,14 @@ class MaskFiles:
         importance: np.ndarray | None = None
         alpha = None if photo is None else decode_alpha(photo)
         min_level = 191  # level of 255; a pixel counts if three quarters of the file's pixels in it count
+        if photo is not None and self.canvas not in (None, image_size(photo)):
+            whole = np.full(image_size(photo)[::-1], True)
+            alpha = whole if alpha is None else alpha
+            inside = extend_picture(turn_picture(whole, self.turns[view]), image_size(photo), self.canvas)
+            importance = (self._reduce(inside * _WHITE, view) > 0).astype(np.float32)  # 0 beyond the photo
         if alpha is not None:
-            opaque = cut_part(turn_picture(alpha, self.turns[view]), self.part) * _WHITE
+            upright = turn_picture(alpha, self.turns[view])
+            opaque = cut_part(extend_picture(upright, upright.shape[1::-1], self.canvas), self.part) * _WHITE
             counts = self._reduce(opaque, view) > min_level
         if (mask := self.masks[view]) is not None:
             levels = self._read_levels(mask, view)
@@ -81,7 +89,7 @@ class MaskFiles:
             counts = (light > min_level) if counts is None else counts & (light > min_level)
             if (levels[is_light] < _WHITE).any():  # grey means a lower weight: the mean over the pixels that count
                 shares = self._reduce(levels * is_light, view) / np.maximum(light, np.float32(1))
-                importance = np.where(light > 0, shares, np.float32(1))
+                importance = np.where(light > 0, shares, np.float32(1)) * (1 if importance is None else importance)
         if (mask := self.protecting[view]) is not None:
             share = self._reduce(self._read_levels(mask, view), view) / np.float32(_WHITE)
             importance = (1 if importance is None else importance) * (1 + (PROTECTED - 1) * share)
@@ -95,8 +103,9 @@ class MaskFiles:
             size = image_size(photo)
             if turns % 2 and same_shape(size, whole.shape[1::-1]):
                 whole = turn_picture(whole, turns)
-            if same_shape(size[::-1] if turns % 2 else size, whole.shape[1::-1]):
-                whole = cut_part(whole, self.part)
+            upright = size[::-1] if turns % 2 else size
+            if same_shape(upright, whole.shape[1::-1]):
+                whole = cut_part(extend_picture(whole, upright, self.canvas), self.part)
         if not same_shape(self.stored, whole.shape[1::-1]):
             (width, height), (columns, lines) = self.stored, whole.shape[1::-1]
             problem = (
@@ -156,7 +165,7 @@ def read_masks(
 
     masks, protecting = list_by_view(photo_masks), list_by_view(photo_protecting)
     turns = photos.turns or (0,) * len(masks)
-    mask_files = MaskFiles(tuple(paths), turns, masks, protecting, photos.fit.part, stored, cut, cameras)
+    mask_files = MaskFiles(tuple(paths), turns, masks, protecting, photos.fit.part, photos.canvas, stored, cut, cameras)
     counts, importance = zip(*parallel_map(mask_files.read, range(len(masks))), strict=True)
     error, place = (CameraMaskError, camera_file.path) if by_cameras else (SceneError, files.masks or "")
     _refuse_photos(error, place, "masks", masks, photos.pictures)

@@ -25,11 +25,13 @@ from gsmerge.io.cameras.table import FFGS
 from gsmerge.io.first_bytes import CONVERT
 from gsmerge.io.image_names import IMAGE_SUFFIXES, find_image, list_images, natural_order, propose_images
 from gsmerge.io.photo_files import (
+    ASPECT_TOLERANCE,
     PhotoArrays,
     Size,
     decode_images,
     decode_photos,
     decode_small,
+    extend_picture,
     image_size,
     orientation_turn,
     part_size,
@@ -41,7 +43,7 @@ from gsmerge.reading.alignment import ESTIMATED
 from gsmerge.reading.photos.assign_photos import Assigner, Candidates, assign_photos
 from gsmerge.reading.photos.grid_fit import WHOLE_FIT, GridFit, PartFit, choose_fit, list_fits
 from gsmerge.reading.photos.offsets import OFFSET_PIXELS, correlate_parts
-from gsmerge.reading.photos.view_pictures import show_views
+from gsmerge.reading.photos.view_pictures import ViewPictures, show_views
 from gsmerge.reading.scene_files import SceneFiles, list_folders
 from gsmerge.runtime.record import list_some
 from gsmerge.runtime.threads import parallel_map
@@ -69,6 +71,9 @@ class ScenePhotos:
     paths: tuple[Path | None, ...] = ()  # the photo of each camera; None for a camera without a photo
     turns: tuple[int, ...] = ()  # orientation of each photo, 0 to 7; see gsmerge.kernels.pictures.turn_picture
     faults: tuple[str | None, ...] = ()  # for each camera, why its photo cannot be used; None for no fault
+    # Size to which upright photos of several shapes are extended, see gsmerge.io.photo_files.extend_picture; None: all
+    # have one shape
+    canvas: Size | None = None
     fit: PartFit = WHOLE_FIT  # the part of each upright photo that is used
     grid_fit: GridFit | None = None  # how files are resized and cropped to the grid of rows, if cameras are estimated
     explain_most: bool = False  # True: the proposed photos explain what most views show
@@ -91,7 +96,8 @@ class ScenePhotos:
     def list_sizes(self) -> list[Size]:
         """List the size of the used part of each photo when it is upright."""
         stored = [(image_size(path), turn) for path, turn in zip(self.paths, self.turns, strict=True) if path]
-        return [part_size(size[::-1] if turn % 2 else size, self.fit.part) for size, turn in stored]
+        upright = [size[::-1] if turn % 2 else size for size, turn in stored]
+        return [part_size(self.canvas or size, self.fit.part) for size in upright]
 
     def without_files(self, reasons: Mapping[Path, str]) -> ScenePhotos:
         """Return a copy without files that cannot be used, each with the reason.
@@ -313,16 +319,18 @@ def read_photos(photos: ScenePhotos, camera_file: CameraFile) -> ScenePhotos:
             problem = f"expected photos with one aspect ratio, found {width} x {height} and {size[0]} x {size[1]}"
             raise SceneError(photos.folder, problem)
     damaged = dict[Path, str]()
-    pictures = decode_photos(photos.paths, photos.turns, photos.fit.stretch(size), photos.fit.part, damaged)
+    part, canvas = photos.fit.part, photos.canvas
+    pictures = decode_photos(photos.paths, photos.turns, photos.fit.stretch(size), part, damaged, canvas)
     return replace(photos, pictures=pictures, damaged=damaged)
 
 
 def keep_one_shape(camera_file: CameraFile, photos: ScenePhotos) -> tuple[CameraFile, ScenePhotos, list[str]]:
-    """Leave out photos that lack the aspect ratio of most photos, and views whose cameras lack it.
+    """Bring photos of several shapes to one, or leave out those that lack the shape of most photos, and their views.
 
-    If all cameras have one aspect ratio, all views are kept, and photos may lie on their side. A camera without a size
-    has the aspect ratio of its photo. Nothing is left out if fewer than two views would remain. Also return a doubt if
-    views are left out.
+    If each photo has the shape of its own camera, all are extended to a canvas on which each fits. Otherwise, if all
+    cameras have one aspect ratio, all views are kept, and photos may lie on their side. A camera without a size has the
+    aspect ratio of its photo. Nothing is left out if fewer than two views would remain. Also return a doubt if views
+    are left out, or a note about the canvas.
     """
     sizes = {path: image_size(path) for path in photos.named if path is not None}
     if not sizes:
@@ -330,6 +338,21 @@ def keep_one_shape(camera_file: CameraFile, photos: ScenePhotos) -> tuple[Camera
     (width, height), _ = Counter(sizes[path] for path in photos.named if path is not None).most_common(1)[0]
     camera_sizes = list(zip(camera_file.widths.tolist(), camera_file.heights.tolist(), strict=True))
     are_alike = all(min(size) > 1 and same_shape(size, camera_sizes[0]) for size in camera_sizes)
+    pairs = [  # sizes of photo and camera; a size of 1 pixel means that the camera has no size
+        (sizes[path], size if min(size) > 1 else sizes[path])
+        for path, size in zip(photos.named, camera_sizes, strict=True)
+        if path is not None
+    ]
+    scales = [photo[0] / camera[0] for photo, camera in pairs]
+    fits_cameras = all(same_shape(*pair) for pair in pairs) and max(scales) - min(scales) <= ASPECT_TOLERANCE
+    are_several = not all(same_shape(photo, (width, height)) for photo, _ in pairs)
+    if are_several and fits_cameras and not are_alike and len(pairs) == len(camera_sizes):
+        canvas = max(width for (width, _), _ in pairs), max(height for (_, height), _ in pairs)
+        sides = [round(side / scales[0]) for side in canvas]
+        widths, heights = (np.full_like(camera_file.widths, side) for side in sides)
+        count = len({photo for photo, _ in pairs})
+        note = f"photos of {count} shapes are extended to {canvas[0]} x {canvas[1]}; what is added does not count"
+        return replace(camera_file, widths=widths, heights=heights), replace(photos, canvas=canvas), [note]
     shape = f"the aspect ratio of {width} x {height}"
     others = {  # the photos with another aspect ratio
         path: "{} x {}, not {}".format(*size, shape)
@@ -364,7 +387,8 @@ def _list_candidates(photos: ScenePhotos) -> Candidates:
         """Read a small version of a photo, and cut out the part that is used."""
         small = np.zeros((OFFSET_PIXELS, OFFSET_PIXELS, 3), np.float32)
         with suppress(SceneError):
-            small = decode_small(photos.pool[number], OFFSET_PIXELS)
+            path = photos.pool[number]
+            small = extend_picture(decode_small(path, OFFSET_PIXELS), image_size(path), photos.canvas)
         small = photos.fit.cut(small)
         return small if photos.grid_fit is None else photos.grid_fit.cut(small)
 
@@ -388,7 +412,18 @@ def assign_to_views(scene: Scene, photos: ScenePhotos, camera_file: CameraFile, 
     if read and images is not None:
         view_of_photo = {photo: view for view, photo in enumerate(named) if photo is not None}
         candidates = replace(stored, read=lambda photo: images[view_of_photo[photo]])
-    show = partial(show_views, replace(scene, masks=None))
+
+    def show(side: int) -> ViewPictures:
+        """Make pictures of the views, without what lies beyond the photos that are proposed for them."""
+        shown = show_views(replace(scene, masks=None), side)
+        for view, path in enumerate(photos.named):
+            if photos.canvas is not None and path is not None:
+                height, width = shown.weights.shape[1:]
+                shares = np.divide(image_size(path), photos.canvas)
+                shown.weights[view, round(height * shares[1]) :] = 0
+                shown.weights[view, :, round(width * shares[0]) :] = 0
+        return shown
+
     assigned, explain_most = assign_photos(show, candidates, named, exact=photos.exact, stored=stored)
     faults = list(photos.faults)
     for view in guessed:
@@ -418,7 +453,8 @@ def has_other_shape(photos: ScenePhotos, camera_file: CameraFile) -> bool:
     Another aspect ratio is expected if the cameras' source is known to resize or crop photos; the result is False then.
     """
     first, shapes = next(filter(None, photos.named), None), sizes_of(camera_file)
-    if first is None or not shapes or camera_file.photo_map is not None or camera_file.source in (FFGS, SHARP):
+    is_known = camera_file.photo_map is not None or camera_file.source in (FFGS, SHARP) or photos.canvas is not None
+    if first is None or not shapes or is_known:
         return False
     size = photos.fit.stretch(part_size(image_size(first), photos.fit.part))
     return not any(same_shape(shape, turned) for shape in shapes for turned in (size, size[::-1]))

@@ -154,8 +154,10 @@ def test_a_photo_whose_content_is_in_a_format_that_is_not_read(folder: Path, sta
 
 
 @pytest.mark.parametrize("sizes", ["apart", "of all"])
-def test_photo_of_another_shape_is_left_out(folder: Path, truth: np.ndarray, sizes: str) -> None:
-    """A portrait among landscapes: its view is left out with its Gaussians' pixels, and the others are used."""
+def test_photo_of_another_shape_is_used_if_its_camera_has_its_shape(
+    folder: Path, truth: np.ndarray, sizes: str
+) -> None:
+    """A portrait among landscapes: it is extended with its Gaussians' pixels, or its view is left out."""
     path, file = photos_in(folder)[3], folder / "transforms.json"
     picture = (read(path)[:, 42:150] * 255).astype(np.uint8)
     Image.fromarray(picture).save(path)
@@ -172,10 +174,13 @@ def test_photo_of_another_shape_is_left_out(folder: Path, truth: np.ndarray, siz
         cameras = {key: value for key, value in cameras.items() if key not in common}
         file.write_text(json.dumps(cameras))
     loaded = load_scene(folder)
-    assert len(loaded.scene.photo_views) == 3
+    assert len(loaded.scene.photo_views) == (4 if sizes == "apart" else 3)
     photos = np.asarray(loaded.scene.images)[:3]
     assert np.abs(photos - truth[:3]).mean((1, 2, 3)).max() < 0.02
-    assert loaded.doubts
+    if sizes == "apart":
+        assert loaded.scene.has_own_pixels
+        assert not loaded.doubts
+        return
     assert names(str(loaded.doubts), "1 of 4 views", path.name)
     assert not any("no camera" in note for note in loaded.notes)
 
