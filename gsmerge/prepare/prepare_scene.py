@@ -284,6 +284,9 @@ def scored_pictures(scene: Scene) -> tuple[Scene, bool]:
                 if canonical.has_own_pixels:
                     compared = equalise_exposure(compared, views, "auto")
                 left_out = len(views) < len(given.photo_views)
+                masked = mask_background(with_pixels(given))
+                if masked.masks is not given.masks:
+                    scene = replace(scene, masks=masked.masks)
                 return scene, left_out or _has_changed(given.images, compared, views, range(len(given)))
         colored = add_row_colors(replace(canonical, images=None, large_photos=None, masks=None))
     return replace(scene, images=colored.images, masks=colored.masks), False

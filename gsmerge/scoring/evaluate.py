@@ -163,6 +163,7 @@ class _Split:
     covered: NDArray[np.bool_] | None  # [v,h,w] pixels that the input covers; None: where the input is opaque
     reference: str  # words for the pictures with which results are compared, such as "photos"
     scored: Sequence[int]  # ids of the views that are scored
+    masks: NDArray[np.bool_] | None  # [v,h,w] pixels that count; None: all count
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,7 +244,9 @@ def evaluate(
     with use_threads(options.threads):
         renderer = _Renderer(near_plane(scene), options)
         progress("what the input views see", 0, 0)
-        splits = _make_splits(scene, PHOTOS if scene is original else ROW_COLORS, inputs, targets, renderer)
+        splits = _make_splits(
+            scene, PHOTOS if scene.images is original.images else ROW_COLORS, inputs, targets, renderer
+        )
         scored = {INPUT: inputs, **outputs} if options.own else outputs
         compared = scene.gaussians.numpy(), outputs, scene.cameras, renderer.near, progress, marks
         fog = measure_fog(*compared) if options.fog and outputs else {}
@@ -330,9 +333,10 @@ def _make_splits(
         """Return a split; ``words`` describe the pictures of the views, and pixels outside ``masks`` do not count."""
         visible, scored = visible_pixels(points, views.cameras, renderer.near, sources), list(range(len(views.names)))
         if masks is not None:
-            visible &= [resize_mask(mask, cameras.width, cameras.height) for mask in masks]
+            masks = np.stack([resize_mask(mask, cameras.width, cameras.height) for mask in masks])
+            visible &= masks
             scored = [view for view in scored if masks[view].any()] or scored
-        return _Split(views, visible, covered=None, reference=words, scored=scored)
+        return _Split(views, visible, covered=None, reference=words, scored=scored, masks=masks)
 
     held_out = {} if targets is None else {"target": make_split(targets, PHOTOS)}
     if targets is not None and not renderer.options.context:
@@ -379,7 +383,7 @@ def _score_split(
             seconds = time.perf_counter() - start
             on_image(name, kind, view, image)
             if name == INPUT and covered is None:
-                covered = is_opaque
+                covered = is_opaque if split.masks is None else is_opaque & split.masks[view]
             score = ViewScore(kind, names[view], float(split.visible[view].mean()), Quality(), Quality())
             if view in split.scored:
                 score = _add_qualities(score, image, split, view, covered, nets)

@@ -10,12 +10,13 @@ import numpy as np
 
 from gsmerge.drawing.camera_path import outside_camera
 from gsmerge.drawing.pages.splats import MAX_GAUSSIANS, highest_degree, pack_splats
-from gsmerge.drawing.preview import OUTSIDE_VIEW, BytePicture, to_picture
+from gsmerge.drawing.preview import OUTSIDE_VIEW, BytePicture, lay_on_chequer, to_picture
 from gsmerge.geometry.frame import Frame, scene_frame
 from gsmerge.geometry.transforms import middle_depth
 from gsmerge.geometry.views import even_views
 from gsmerge.io.photo_files import encode_picture, photo_array
 from gsmerge.prepare.confirm_depths import Agreement, confirm_depths
+from gsmerge.prepare.fill_holes import large_parts
 from gsmerge.raster import render
 from gsmerge.raster.metrics import is_worse
 from gsmerge.raster.photos import NEAR_PLANE, WHOLE_SHARE
@@ -23,9 +24,11 @@ from gsmerge.runtime.record import Progress
 from gsmerge.runtime.threads import use_threads
 from gsmerge.scoring.evaluate import INPUT, EvaluateOptions, Evaluation, Quality, ResultScores, evaluate
 from gsmerge.scoring.lpips import lpips_available
+from gsmerge.scoring.sizes import shrink_cameras
 from gsmerge.types import Cameras, Gaussians, Scene, Views
 
 LPIPS = "alex"  # network of LPIPS, if its weights are installed; it takes 0.05 s per picture, "vgg" 0.8 s
+CUT_OUT_PIXELS = 128  # longer side of the pictures in which a cut-out is recognised
 MAX_SHOWN_VIEWS = 32  # most views in a page, chosen at equal intervals; each takes up to 300 kB
 SplitViews = tuple[Cameras, np.ndarray, Sequence[str]]  # cameras in the world, photos and names of a split
 Stills = dict[tuple[str, str, int], bytes]  # WebP, by result, split and view
@@ -77,6 +80,7 @@ class ViewData:
     notes: tuple[str, ...]  # warnings and limits, one sentence each
     lacks_pixels: bool = False  # if True, the scene itself does not cover all pixels of the input views
     agreement: Agreement | None = None  # share of the depth that other views confirm; None: not known
+    cut_out: bool = False  # if True, the scene shows nothing in large parts of a view
 
     @property
     def shown(self) -> tuple[PageView, ...]:
@@ -130,15 +134,25 @@ def collect_page_data(
     """
     stills: Stills = {}
 
+    shown_gaussians = {INPUT: scene.file_gaussians, **{name: gaussians.numpy() for name, gaussians in results.items()}}
+    small = shrink_cameras(scene.cameras.numpy(), CUT_OUT_PIXELS)
+    cut_out = any(large_parts(alpha[..., 0] < 0.5).any() for alpha in render(scene.gaussians.numpy(), small).alphas)
+
     def add_still(result: str, split: str, view: int, image: np.ndarray) -> None:
-        """Keep the render ``[h,w,3]`` of a view of a split as an encoded still."""
+        """Keep the render ``[h,w,3]`` of a view of a split as an encoded still, of a cut-out on a chequered ground."""
+        if cut_out:
+            moved = (cameras or {}).get(result, scene.cameras)
+            of_split = moved if split == "context" or held_out is None else held_out.cameras
+            one = replace(of_split.numpy()[[view]], antialiased=moved.antialiased)
+            alpha = render(shown_gaussians[result], one, near=NEAR_PLANE * scene_frame(scene).unit).alphas[0, ..., 0]
+            image = lay_on_chequer(image, 1 - alpha)
         stills[result, split, view] = encode_still(to_picture(image))
 
     options = EvaluateOptions((LPIPS,) if lpips_available(LPIPS) else (), None, fog=False)
     evaluation = evaluate(scene, results, held_out, options, cameras=cameras, progress=progress, on_image=add_still)
     progress("the view from outside", 0, 0)
     with use_threads():
-        data = _fill_page(title, scene, results, file_bytes, held_out, evaluation, stills, light=light)
+        data = _fill_page(title, scene, results, file_bytes, held_out, evaluation, stills, light=light, cut_out=cut_out)
     progress("done", 0, 0)
     gains, sides, notes = new_gains or {}, [], list[str]()
     for side in data.sides:
@@ -163,6 +177,7 @@ def _fill_page(
     stills: Stills,
     *,
     light: bool,
+    cut_out: bool,
 ) -> ViewData:
     """Collect the content of a page from an evaluation and its stills, without gains; see :func:`collect_page_data`."""
     pictures = photo_array(evaluation.pictures)
@@ -182,10 +197,13 @@ def _fill_page(
     views = _list_views(splits, evaluation, stills, frame, means)
     shown = _choose_shown(views)
     camera, distance = outside_camera(scene.cameras.numpy(), named[INPUT].means)
-    renders = (
+    renders = [
         render(gaussians, camera, antialiased=side.antialiased, near=NEAR_PLANE * frame.unit)
         for gaussians, side in zip(named.values(), sides, strict=True)
-    )
+    ]
+    outside_images = [drawn.images[0] for drawn in renders]
+    if cut_out:
+        outside_images = [lay_on_chequer(drawn.images[0], 1 - drawn.alphas[0, ..., 0]) for drawn in renders]
     outside = PageView(
         name=OUTSIDE_VIEW,
         place=len(views),
@@ -193,7 +211,7 @@ def _fill_page(
         camera=frame.enter_cameras(camera),
         distance=distance / frame.unit,
         photo=None,
-        stills=tuple(encode_still(to_picture(drawing.images[0])) for drawing in renders),
+        stills=tuple(encode_still(to_picture(picture)) for picture in outside_images),
         scores=(),
         outside=True,
     )
@@ -204,7 +222,7 @@ def _fill_page(
     agreement = confirm_depths(replace(scene, gaussians=frame.enter(scene.gaussians), cameras=scene_cameras))
     return ViewData(
         title, tuple(sides), shown, outside, len(views), evaluation.reference, notes,
-        lacks_pixels, agreement,
+        lacks_pixels, agreement, cut_out,
     )  # fmt: skip
 
 

@@ -69,6 +69,7 @@ def view_page(data: ViewData) -> bytes:
         json_data={
             "sources": sources,
             "photos": has_photos,
+            "background": "#808080" if data.cut_out else "#000000",
             "lpips": any(side.mean.lpips_alex is not None for side in data.sides),
             "start": data.start,
             "results": [

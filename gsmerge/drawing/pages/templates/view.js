@@ -6,7 +6,7 @@ const id = (name) => document.getElementById(name);
 const data = JSON.parse(id("data").textContent);
 const stage = id("stage");
 const state = {
-  view: data.start, mode: data.sources.length > 1 ? "swipe" : "blink", at: 0.5, solid: "", shape: "splats", frustums: "", background: "#000000", pixels: "screen",
+  view: data.start, mode: data.sources.length > 1 ? "swipe" : "blink", at: 0.5, solid: "", shape: "splats", frustums: "", background: data.background, pixels: "screen",
   order: "worst", overlay: 0, other: false, from: data.start, // `from` is the view before the step back
   atCamera: true, left: 0, right: 0, scheme: "",
   result: 0, zoom: 1, centre: [0.5, 0.5], // `centre` is the point of the stills in the middle, in shares of the picture

@@ -304,3 +304,15 @@ def test_stills_of_a_result_are_from_its_own_cameras(small: Scene) -> None:
         assert before.stills[0] == after.stills[0]
         assert before.stills[1] != after.stills[1]
         np.testing.assert_array_equal(before.camera.viewmats, after.camera.viewmats)
+
+
+def test_a_cut_out_lies_on_a_chequered_ground(scene: Scene) -> None:
+    """Of stills; in 3D its ground is grey."""
+    middle = np.abs(scene.gaussians.means[:, 0]) < 0.2
+    cut = replace(scene, gaussians=scene.gaussians[np.flatnonzero(middle)], pixels=None)
+    data = collect_page_data("cut", cut, {"same": cut.gaussians}, [1, 1])
+    assert data.cut_out
+    still = decoded(data.views[0].stills[0])
+    levels = np.unique((10 * still[:, :4]).round())  # beside the object
+    assert set(levels) <= {4, 6} | {5}
+    assert not collect_page_data("whole", scene, {}, [1]).cut_out
