@@ -19,10 +19,10 @@ from gsmerge.runtime.record import note
 from gsmerge.types import PicturedScene
 
 # All radii are in widths of a Gaussian, see measure_unit. Left-out pixels are empty in holes of the input of at least
-# the radius HOLE, and in the rim RIM around these holes, where Gaussians of an object reach over its edge. Beside a
-# large empty part that no mask leaves out, pixels without Gaussians are empty up to REACH, and photos do not count in
-# the next RING pixels
-HOLE, RIM, REACH, RING = 3, 2, 8, 3
+# the radius HOLE, and in the rim RIM around these holes, where Gaussians of an object reach over its edge. In a view
+# with a large empty part that no mask leaves out, as of an object, other holes are empty, too, and photos do not count
+# in the next RING pixels
+HOLE, RIM, RING = 3, 2, 3
 SOFT = 1  # width of the edge between a uniform background and an object, where the photo mixes both
 NOISE = np.float32(16 / 255)  # largest difference between the colour of a uniform background and a pixel of it
 MOST_OTHER = 0.05  # largest share of the pixels of a uniform background that differ more
@@ -67,7 +67,7 @@ def draw_left_out(scene: PicturedScene, masks: np.ndarray | None) -> PicturedSce
     for view, hole in enumerate(holes):
         left_out = np.zeros(hole.shape, bool) if masks is None else ~masks[view]
         nothing = _grow(~_grow(~bare[view], HOLE * unit), HOLE * unit)
-        cut = (hole | (nothing & _grow(hole, REACH * unit))) & ~left_out
+        cut = (hole | nothing if hole.any() else hole) & ~left_out
         counts[view] &= ~_grow(cut, RING * unit)
         left_out |= cut
         is_empty = (hole | _grow(nothing & left_out, RIM * unit)) & left_out
