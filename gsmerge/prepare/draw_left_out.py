@@ -25,27 +25,39 @@ from gsmerge.types import PicturedScene
 HOLE, RIM, RING = 3, 2, 3
 SOFT = 1  # width of the edge between a uniform background and an object, where the photo mixes both
 NOISE = np.float32(16 / 255)  # largest difference between the colour of a uniform background and a pixel of it
-MOST_OTHER = 0.05  # largest share of the pixels of a uniform background that differ more
+LEAST_ALIKE = 0.95  # least share of the pixels of a uniform background that differ less
+SOLID = 0.95  # opacity of a picture from which on it shows an object, and not Gaussians that reach over its edge
 
 
 def mask_background(scene: PicturedScene) -> PicturedScene:
-    """Leave out the uniform background of photos of an object, which is where the input shows nothing."""
+    """Leave out the uniform background of photos of an object, which is where the input shows nothing.
+
+    Its pixels get the mean colour of the object. A cropped scene is part of a place, of which photos show more.
+    """
+    if scene.region is not None:
+        return scene
     fronts, counts = scene.get_pixels().fronts, _counting(scene)
     bare, num_views = (fronts < 0) | (scene.gaussians.opacities[fronts] <= BARE), 0
-    unit = measure_unit(scene)
+    unit, images = measure_unit(scene), [*scene.images]
     for view, photo in enumerate(scene.images):
         part = large_parts(bare[view]) & counts[view]
         if not part.any():
             continue
-        differs = np.abs(photo - np.median(photo[part], 0)).max(-1) > NOISE
-        if differs[part].mean() <= MOST_OTHER:
+        is_alike = np.abs(photo - np.median(photo[part], 0)).max(-1) <= NOISE
+        if is_alike[part].mean() >= LEAST_ALIKE:
+            # an object of the background's colour is solid; large Gaussians reach over its edge, and are not
             alpha = render(scene.gaussians, scene.cameras[[view]]).alphas[0, ..., 0]
-            counts[view] &= ~_grow(~differs & _grow(1 - alpha > COVERED_TRANSMITTANCE, RIM * unit), SOFT * unit)
+            _, labels = cv2.connectedComponents(is_alike.astype(np.uint8), connectivity=4)
+            around = np.isin(labels, labels[part & is_alike]) & _grow(alpha < SOLID, RIM * unit)
+            counts[view] &= ~_grow(around | (is_alike & bare[view]), SOFT * unit)
+            # contrast with a bright background would hide what the object shows where photos are compared
+            inner = photo[counts[view]].mean(0) if counts[view].any() else photo[part].mean(0)
+            images[view] = np.where(counts[view][..., None], photo, inner)
             num_views += 1
     if not num_views:
         return scene
     note(f"{num_views} of {len(scene)} photos show one colour where the scene shows nothing; it counts as transparent")
-    return replace(scene, masks=counts)
+    return replace(scene, masks=counts, images=np.stack(images))
 
 
 def draw_left_out(scene: PicturedScene, masks: np.ndarray | None) -> PicturedScene:

@@ -30,7 +30,7 @@ from gsmerge.prepare.row_colors import NO_PHOTOS, PHOTOS, RENDERS, ROW_COLORS, a
 from gsmerge.prepare.scene_size import SceneSize, measure_size, unlike_captures
 from gsmerge.prepare.true_pixels import raise_sizes, with_pixels
 from gsmerge.runtime.record import note, record_choices, record_part, stage
-from gsmerge.settings.stages import Look, PrepareOptions
+from gsmerge.settings.stages import PrepareOptions
 from gsmerge.types import Cameras, PicturedScene, Scene
 
 LEAST_VIEWS = 4  # fewest views with photos of which some are left out; of fewer views, too little would remain
@@ -147,7 +147,7 @@ def prepare(
         note(text)
     scene, frame = canonicalise(add_views(scene), frame)
     scene = raise_sizes(with_pixels(scene) if pixels or not placed else scene, placed=placed)
-    scene, reference = choose_pictures(scene, options.look, placed=placed)
+    scene, reference = choose_pictures(scene, options, placed=placed)
     is_moved, files = False, input_scene.images
     if reference.of_views:
         input_scene = _with_photos(input_scene, scene, repeated)
@@ -164,8 +164,6 @@ def prepare(
         if agreement.advice:
             note(agreement.advice)
     if fill and reference.of_views:
-        if reference.name == PHOTOS and options.extent != "photos":
-            scene = mask_background(scene)
         views, shown, masks = reference.score_views, np.zeros(scene.images.shape[:3], bool), scene.masks
         has_row_colors = reference.name == ROW_COLORS  # these pictures have colours at all pixels
         shown[list(views)] = True if has_row_colors or masks is None else masks[list(views)]
@@ -182,7 +180,7 @@ def prepare(
     return Prepared(input_scene, scene, frame, reference, tuple(repeated), is_moved, agreement)
 
 
-def choose_pictures(scene: Scene, look: Look, *, placed: bool) -> tuple[PicturedScene, Reference]:
+def choose_pictures(scene: Scene, options: PrepareOptions, *, placed: bool) -> tuple[PicturedScene, Reference]:
     """Return a canonical scene with the pictures to which results are fitted, and how they are used.
 
     Photos that show the scene are used first. If no photo shows the scene, a view's picture has the colours of its
@@ -190,7 +188,10 @@ def choose_pictures(scene: Scene, look: Look, *, placed: bool) -> tuple[Pictured
     """
     has_photos, every = scene.images is not None, tuple(range(len(scene)))
     if scene.images is not None:
-        pictured, views = compare_photos(PicturedScene.with_pictures(scene, scene.images, scene.masks), look)
+        pictured = PicturedScene.with_pictures(scene, scene.images, scene.masks)
+        if options.extent != "photos" and options.look != "scene":
+            pictured = mask_background(pictured)  # before photos are compared, which show nothing of the scene there
+        pictured, views = compare_photos(pictured, options.look)
         if views:
             return pictured, Reference(PHOTOS, views)
     scene = replace(scene, images=None, large_photos=None, masks=None)
@@ -278,15 +279,14 @@ def scored_pictures(scene: Scene) -> tuple[Scene, bool]:
     with record_part(silent=True):
         canonical = canonicalise(scene)[0]
         if scene.images is not None:
-            given = PicturedScene.with_pictures(canonical, scene.images, scene.masks)
+            given = mask_background(with_pixels(PicturedScene.with_pictures(canonical, scene.images, scene.masks)))
             compared, views = compare_photos(given)
             if views or not scene.has_own_pixels:
                 if canonical.has_own_pixels:
                     compared = equalise_exposure(compared, views, "auto")
                 left_out = len(views) < len(given.photo_views)
-                masked = mask_background(with_pixels(given))
-                if masked.masks is not given.masks:
-                    scene = replace(scene, masks=masked.masks)
+                if given.masks is not canonical.masks:
+                    scene = replace(scene, masks=given.masks)
                 return scene, left_out or _has_changed(given.images, compared, views, range(len(given)))
         colored = add_row_colors(replace(canonical, images=None, large_photos=None, masks=None))
     return replace(scene, images=colored.images, masks=colored.masks), False

@@ -272,7 +272,9 @@ def check_masks(masks: Masks, files: SceneFiles, scene: Scene) -> tuple[Masks, l
         return NO_MASKS, [Doubt(f"masks are not used: {where}: {problem}; name them with --masks")]
     if not is_named and 2 * _share_of_gaussians(scene, counts) < 1:
         problem = f"they leave out {100 * share:.0f} % of the photos' pixels, and most of what the Gaussians show"
-        remedy = f"if they are right, name masks with --masks; otherwise pass --masks {NONE}"
+        remedy = (
+            f"if they are right, name them with --masks, transparency saved as grey pictures; or pass --masks {NONE}"
+        )
         return NO_MASKS, [Doubt(f"masks are not used: {where}: {problem}; {remedy}")]
     count = int((~counts.all((1, 2))).sum())
     return masks, [

@@ -81,3 +81,18 @@ def test_shares_of_emptiness_are_the_transmittance_of_the_input(room: Scene) -> 
     expected = 1 - render(prepared.gaussians, prepared.cameras).alphas[..., 0]
     np.testing.assert_allclose(prepared.empty[inner], expected[inner], atol=1e-6)
     assert (prepared.empty[:, :, 31:] == 0).all()
+
+
+def test_photos_of_an_object_are_compared_without_their_background(ball: Scene, room: Scene) -> None:
+    """Its contrast with the object is none of the object's, also of rows that are pixels and in holes of the object."""
+    alphas = render(ball.gaussians, ball.cameras).alphas[..., 0]
+    inside = alphas > 0.5
+    inside[:, 36:40, 40:56] = False
+    scene = scenes.shown_in(room, inside)
+    for level in (0.0, 1.0):
+        photos = np.where(inside[..., None], room.images, np.float32(level))
+        prepared = prepare(replace(scene, images=photos))
+        assert prepared.reference.score_views == (0, 1, 2, 3)
+        assert prepared.scene.masks is not None
+        assert not (prepared.scene.masks & ~inside).any()
+        assert prepared.scene.masks[inside].mean() > 0.6
