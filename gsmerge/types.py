@@ -438,6 +438,11 @@ class Scene(ArrayFields):
         return [view for view, mask in enumerate(self.masks) if mask.any()]
 
     @property
+    def beyond(self) -> np.ndarray | None:
+        """Mask ``[v,h,w]`` of what lies beyond photos that were extended, which have no importance; None if nothing."""
+        return None if self.importance is None else self.importance == 0
+
+    @property
     def protected(self) -> np.ndarray | None:
         """Mask ``[v,h,w]`` of the protected pixels, by their importance; None if no pixel is protected."""
         if self.images is None or self.importance is None:
@@ -488,8 +493,8 @@ def fill_pixels(scene: SceneT, added: Gaussians, empty_pixels: np.ndarray) -> Sc
 class PicturedScene(Scene):
     """A scene in which every view has a picture: its photo or, without photos, colours or renders of its Gaussians.
 
-    ``empty [v,h,w]`` marks the pixels in which the scene may show nothing, by a mask or a share of each pixel. Pictures
-    are black in these pixels, and scores leave them out. None: no pixel.
+    ``empty [v,h,w]`` is the share of each pixel in which the scene shows nothing, its transmittance; None: 0. It is
+    above 0 only in pixels of renders, and in pixels that masks leave out, whose pictures are multiplied by 1 - empty.
     """
 
     images: np.ndarray

@@ -31,7 +31,13 @@ OUTSIDE_VIEW = "step back"  # name of the outside view
 
 
 def to_picture(image: np.ndarray) -> BytePicture:
-    """Convert a picture ``[h,w,3]``, float in [0, 1], to 8 bits; also a transparent one, ``[h,w,4]``."""
+    """Convert a picture ``[h,w,3]``, float in [0, 1], to 8 bits.
+
+    The colours of a transparent picture ``[h,w,4]`` are divided by its alpha, as files store them.
+    """
+    if image.shape[-1] == 4:
+        alpha = image[..., 3:]
+        image = np.concatenate([image[..., :3] / np.maximum(alpha, np.float32(1e-6)), alpha], -1)
     return (image.clip(0, 1) * 255).round().astype(np.uint8)
 
 

@@ -152,8 +152,7 @@ class DrawnScenes:
         )
         for pictures in zip(*drawn, strict=True):
             if on_chequer:
-                laid = (lay_on_chequer(image[..., :3] * image[..., 3:], 1 - image[..., 3]) for image in pictures)
-                yield tuple(map(to_picture, laid))
+                yield tuple(to_picture(lay_on_chequer(image[..., :3], 1 - image[..., 3])) for image in pictures)
             else:
                 yield pictures
 

@@ -146,8 +146,7 @@ def decode_photos(
                 raise
             damaged[path] = error.problem
             return np.zeros((size[1], size[0], 3), np.uint8)
-        upright = turn_picture(whole, turn)
-        upright = extend_picture(upright, upright.shape[1::-1], canvas)
+        upright = extend_picture(turn_picture(whole, turn), canvas)
         photo = np.ascontiguousarray(cut_part(upright, part))
         photo_size = photo.shape[1], photo.shape[0]
         return photo if photo_size == size else resize_to(photo_size, size).photos([photo])[0]
@@ -160,11 +159,13 @@ def decode_photos(
     return [decoded[view] for view in views]
 
 
-def extend_picture(picture: np.ndarray, size: Size, canvas: Size | None) -> np.ndarray:
-    """Extend a picture ``[h,w,...]`` of a photo of ``size`` by zeros, to the right and below.
+def extend_picture(picture: np.ndarray, canvas: Size | None, size: Size | None = None) -> np.ndarray:
+    """Extend a picture ``[h,w,...]`` to the size ``canvas`` by zeros, to the right and below.
 
-    The whole picture is to the photo as the result is to the ``canvas``. Without a canvas, return the picture itself.
+    If the picture is a photo of ``size`` at another size, it is extended by the same share as the photo. Without a
+    canvas, return the picture itself.
     """
+    size = size or picture.shape[1::-1]
     if canvas is None or canvas == size:
         return picture
     width, height = (round(side * new / old) for side, new, old in zip(picture.shape[1::-1], canvas, size, strict=True))

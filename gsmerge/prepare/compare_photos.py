@@ -20,7 +20,7 @@ from gsmerge.kernels.pictures import convolve
 from gsmerge.prepare.photo_change import PhotoChange, change_large
 from gsmerge.prepare.row_colors import RowPicture, fill_gaps, picture_rows
 from gsmerge.raster import render
-from gsmerge.raster.photos import row_pictures
+from gsmerge.raster.photos import counting_pixels, row_pictures
 from gsmerge.reading.photos.assign_photos import Assigner, Candidates
 from gsmerge.reading.photos.colors import (
     EXPOSURE_STEP,
@@ -184,7 +184,7 @@ def have_other_tones(scene: PicturedScene, views: Sequence[int]) -> bool:
     """
     solid = np.flatnonzero(scene.gaussians.opacities > COMPARED_OPACITY)
     step = 1 + len(views) * scene.pixels_per_view // TONE_SAMPLE
-    counting = np.full(scene.images.shape[:3], True) if scene.masks is None else scene.masks
+    counting = counting_pixels(scene)
     levels = np.concatenate([scene.images[view][counting[view]][::step] for view in views])
     if not (len(solid) and len(levels)):
         return True
@@ -306,7 +306,7 @@ def _find_hidden(scene: PicturedScene, changes: Sequence[PhotoChange]) -> tuple[
             pictures[view] = drawn.picture
             hidden[view] = differ(view, drawn.picture, known) & differ(view, drawn.drawing, known)
 
-    inside = np.full(scene.images.shape[:3], True) if scene.masks is None else scene.masks
+    inside = counting_pixels(scene)
     pictures, pixels = row_pictures(scene), scene.get_pixels()
     shown = pixels.shown
     with_row = shown & (scene.gaussians.opacities[pixels.fronts] > COMPARED_OPACITY) & inside

@@ -14,7 +14,7 @@ import numpy as np
 from gsmerge.prepare.fill_holes import BARE, large_parts
 from gsmerge.prepare.photo_change import PhotoChange, change_large
 from gsmerge.raster import render
-from gsmerge.raster.photos import COVERED_TRANSMITTANCE
+from gsmerge.raster.photos import COVERED_TRANSMITTANCE, counting_pixels
 from gsmerge.runtime.record import note
 from gsmerge.types import PicturedScene
 
@@ -36,7 +36,7 @@ def mask_background(scene: PicturedScene) -> PicturedScene:
     """
     if scene.region is not None:
         return scene
-    fronts, counts = scene.get_pixels().fronts, _counting(scene)
+    fronts, counts = scene.get_pixels().fronts, counting_pixels(scene).copy()
     bare, num_views = (fronts < 0) | (scene.gaussians.opacities[fronts] <= BARE), 0
     unit, images = measure_unit(scene), [*scene.images]
     for view, photo in enumerate(scene.images):
@@ -65,15 +65,15 @@ def draw_left_out(scene: PicturedScene, masks: np.ndarray | None) -> PicturedSce
 
     ``masks`` are the masks of the photos, before :func:`fill_holes` left out large empty parts.
     """
-    counts = _counting(scene)
+    counts = counting_pixels(scene).copy()
     if counts.all() or scene.region is not None:  # a cropped scene is empty beyond its region
         return scene
     unit, holes = measure_unit(scene), np.zeros(counts.shape, bool) if scene.empty is None else scene.empty > 0
     drawn = render(scene.gaussians, scene.cameras)
     colors, transmittance = drawn.images.clip(0, 1), 1 - drawn.alphas[..., 0]
     bare = transmittance > COVERED_TRANSMITTANCE
-    if scene.importance is not None:  # nothing is known about what lies beyond a photo
-        bare &= scene.importance > 0
+    if scene.beyond is not None:  # nothing is known there
+        bare &= ~scene.beyond
     if scene.has_own_pixels:  # pictures already have the colours of the views' own Gaussians, which are solid
         colors, transmittance = scene.images.copy(), np.zeros_like(transmittance)
     for view, hole in enumerate(holes):
@@ -88,11 +88,6 @@ def draw_left_out(scene: PicturedScene, masks: np.ndarray | None) -> PicturedSce
     images = np.stack([change(photo) for change, photo in zip(changes, scene.images, strict=True)])
     large = None if scene.large_photos is None else change_large(scene.large_photos, changes)
     return replace(scene, images=images, masks=counts, large_photos=large, empty=np.where(counts, 0, transmittance))
-
-
-def _counting(scene: PicturedScene) -> np.ndarray:
-    """Return a copy of the masks ``[v,h,w]``, all True without masks."""
-    return np.full(scene.images.shape[:3], True) if scene.masks is None else scene.masks.copy()
 
 
 def measure_unit(scene: PicturedScene) -> float:

@@ -20,7 +20,7 @@ from gsmerge.prepare.place_cameras import CANDIDATE_GAUSSIANS, PROBE, choose_can
 from gsmerge.prepare.true_pixels import find_pixels
 from gsmerge.raster import render
 from gsmerge.raster.images import thin_out
-from gsmerge.raster.photos import NEAR_PLANE, blank_photos, photo_errors
+from gsmerge.raster.photos import NEAR_PLANE, blank_photos, counting_pixels, photo_errors
 from gsmerge.runtime.record import note, record_choices
 from gsmerge.types import Cameras, Gaussians, PicturedScene, Pixels, make_scene
 
@@ -89,7 +89,7 @@ def _place_beside(gaussians: Gaussians, outside: np.ndarray, cameras: Cameras) -
 
 def _with_drawings(scene: PicturedScene, cameras: Cameras, counting: np.ndarray) -> PicturedScene:
     """Add drawings of a scene from ``cameras``, which count like photos at pixels in the mask ``counting [c,h,w]``."""
-    masks = np.full(scene.images.shape[:3], True) if scene.masks is None else scene.masks
+    masks = counting_pixels(scene)
     importance, empty, large = scene.importance, scene.empty, scene.large_photos
     if large is not None:
         photos, first = large, max(large.ids) + 1

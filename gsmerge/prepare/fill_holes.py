@@ -56,7 +56,7 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = Fa
     ``everywhere``, large empty parts are filled, too. In a cropped scene, all pixels without Gaussians stay empty.
     Notes say what was filled and what stays empty.
     """
-    fronts, is_cropped = scene.get_pixels().fronts, scene.region is not None
+    fronts, is_cropped, beyond = scene.get_pixels().fronts, scene.region is not None, scene.beyond
     fillable = shown & (fronts < 0)  # pixels with a picture and without a Gaussian
     bare = (fronts < 0) | (scene.gaussians.opacities[fronts] <= BARE)  # pixels that seem to show nothing
     views = [
@@ -75,8 +75,8 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = Fa
         covered = transmittance <= 1 - HOLE_OPACITY
         if is_cropped or not everywhere:
             empty[view] = _find_empty(1 - transmittance, shown[view], gap, is_cropped=is_cropped)
-        if scene.importance is not None:  # nothing is known about what lies beyond a photo
-            empty[view] &= scene.importance[view] > 0
+        if beyond is not None:  # nothing is known there
+            empty[view] &= ~beyond[view]
         bare[view] = ~covered & ~empty[view]
         holes[view] = fillable[view] & bare[view]
         if empty[view].any():  # the edges of a scene that was cut out are no holes

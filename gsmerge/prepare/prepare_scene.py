@@ -29,6 +29,7 @@ from gsmerge.prepare.place_cameras import (
 from gsmerge.prepare.row_colors import NO_PHOTOS, PHOTOS, RENDERS, ROW_COLORS, add_row_colors
 from gsmerge.prepare.scene_size import SceneSize, measure_size, unlike_captures
 from gsmerge.prepare.true_pixels import raise_sizes, with_pixels
+from gsmerge.raster.photos import counting_pixels
 from gsmerge.runtime.record import note, record_choices, record_part, stage
 from gsmerge.settings.stages import PrepareOptions
 from gsmerge.types import Cameras, PicturedScene, Scene
@@ -213,7 +214,7 @@ def _has_changed(photos: np.ndarray, scene: PicturedScene, views: Sequence[int],
     """
     if scene.images is photos:
         return False
-    counting = np.full(scene.images.shape[:3], True) if scene.masks is None else scene.masks
+    counting = counting_pixels(scene)
     return any(
         not np.array_equal(before[counting[view]], scene.images[view][counting[view]])
         for before, view in zip(photos, repeated, strict=True)

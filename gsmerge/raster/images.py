@@ -13,7 +13,7 @@ from gsmerge.arrays import Array, like
 from gsmerge.kernels.raster.project import TILE
 from gsmerge.raster.composite import Rendering, background_color, blend, draw_views, prepare_views, view_colors
 from gsmerge.raster.photos import NEAR_PLANE
-from gsmerge.raster.tiled_view import FAR_PLANE, TiledView, make_splats, tile_view
+from gsmerge.raster.tiled_view import FAR_PLANE, Splats, TiledView, make_splats, tile_view
 from gsmerge.runtime.arguments import check_arguments
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians, Scene
@@ -101,7 +101,7 @@ def render_in_batches(
 ) -> Iterator[np.ndarray]:
     """Yield the images ``[h,w,3]`` of :func:`render`, with the same bits, each after ``convert``.
 
-    If ``background`` is None, the images ``[h,w,4]`` have alpha, by which their colours are not multiplied.
+    If ``background`` is None, the images ``[h,w,4]`` have alpha, by which their colours are multiplied.
     At most ``at_once`` images are in memory. Large images are drawn and converted in bands, so ``convert`` has to work
     pixel by pixel. ``columns`` has, for each image, the first column of pixels to draw and the column after the last.
     Tiles outside the columns to draw may show the background only.
@@ -110,11 +110,8 @@ def render_in_batches(
     tile_one = _make_tiler(gaussians, cameras, {"antialiased": cameras.antialiased, "near": near}, columns)
 
     def finish(image: np.ndarray, alpha: np.ndarray) -> np.ndarray:
-        """Return the image, or if there is no background, with alpha, its colours no longer multiplied by alpha."""
-        if background is not None:
-            return image
-        colors = image / np.maximum(alpha, np.float32(1e-6))[..., None]
-        return np.concatenate([colors, alpha[..., None]], -1)
+        """Return the image, with alpha if there is no background."""
+        return image if background is not None else np.concatenate([image, alpha[..., None]], -1)
 
     lines, band_lines = -(-cameras.height // TILE), max(1, BAND_PIXELS // (cameras.width * TILE))
     if lines > band_lines:
@@ -150,15 +147,19 @@ def _make_tiler(
     return tile_one
 
 
+def tile_camera(splats: Splats, cameras: Cameras, view: int, near: float = NEAR_PLANE) -> TiledView:
+    """Tile the view of one camera, as its mark says that Gaussians are drawn."""
+    camera = cameras.viewmats[view].astype(np.float64), cameras.Ks[view].astype(np.float64)
+    return tile_view(splats, *camera, cameras.width, cameras.height, antialiased=cameras.antialiased, near=near)
+
+
 def tile_views(scene: Scene, use: Callable[[int, TiledView], None], views: Sequence[int] | None = None) -> None:
     """Tile all views, or only ``views``, and call ``use(view, tiled)`` for each, in parallel if memory allows."""
-    splats, cameras = make_splats(scene.gaussians), scene.cameras
-    viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
+    splats = make_splats(scene.gaussians)
 
     def tile_and_use(view: int) -> None:
         """Tile one view, and call ``use`` for it."""
-        camera = viewmats[view], Ks[view], cameras.width, cameras.height
-        use(view, tile_view(splats, *camera, antialiased=cameras.antialiased, near=NEAR_PLANE))
+        use(view, tile_camera(splats, scene.cameras, view))
 
     view_ids = range(len(scene)) if views is None else views
     if len(splats) <= ONE_AT_A_TIME:

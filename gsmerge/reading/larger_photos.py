@@ -97,10 +97,8 @@ def find_larger_and_masks(
         """Return the larger photo of a view."""
         if not photos.paths:
             return cut(view, photos.pictures[view])
-        return cut(
-            view,
-            decode_photos([photos.paths[view]], [photos.turns[view]], stored, photos.fit.part, canvas=photos.canvas)[0],
-        )
+        path, turn = photos.paths[view], photos.turns[view]
+        return cut(view, decode_photos([path], [turn], stored, photos.fit.part, canvas=photos.canvas)[0])
 
     large = None
     if (scale * reduction).max() < 1:  # the window has more pixels than the view on both sides

@@ -174,9 +174,9 @@ class _Renderer:
     options: EvaluateOptions
 
     def draw(self, gaussians: Gaussians, cameras: Cameras, view: int) -> tuple[np.ndarray, np.ndarray]:
-        """Render one view ``[h,w,3]``; also return the mask ``[h,w]`` of the pixels with an opacity above a half."""
+        """Render one view; return the image ``[h,w,3]`` and its alpha ``[h,w]``."""
         drawn = render(gaussians, cameras[[view]], near=self.near)
-        return np.asarray(drawn.images[0].clip(0, 1)), np.asarray(1 - drawn.alphas[0, ..., 0] < COVERED_TRANSMITTANCE)
+        return np.asarray(drawn.images[0].clip(0, 1)), np.asarray(drawn.alphas[0, ..., 0])
 
     def image(self, gaussians: Gaussians, cameras: Cameras, view: int) -> np.ndarray:
         """Render one view ``[h,w,3]``."""
@@ -193,6 +193,7 @@ def evaluate(
     cameras: Mapping[str, Cameras] | None = None,
     progress: Progress = lambda *_: None,
     on_image: OnImage = lambda *_: None,
+    on_alpha: OnImage = lambda *_: None,
 ) -> Evaluation:
     """Measure compact results, and the scene itself, on its input views and on held-out views.
 
@@ -206,6 +207,7 @@ def evaluate(
             have them as ``CompactResult.cameras``.
         progress: Called with (name of the step, number done, total); the step of a result is "evaluate: NAME".
         on_image: Called with (result, split, number of the view in the split, render ``[h,w,3]`` in [0, 1]).
+        on_alpha: Called before ``on_image``, with the alpha ``[h,w]`` of the render in its place.
 
     Raises:
         SceneError: If the scene has values of another convention, such as log scales.
@@ -221,12 +223,7 @@ def evaluate(
         >>> evaluation.num_views
         {'context': 5}
     """
-    lpips_notes: Sequence[str] = ()
-    if options is None:
-        from gsmerge.scoring.lpips import installed_networks
-
-        nets, lpips_notes = installed_networks(EvaluateOptions().lpips)
-        options = EvaluateOptions(lpips=nets)
+    options, lpips_notes = (options, ()) if options is not None else _default_options()
     if INPUT in results:
         raise UsageError(f"results: expected names other than {INPUT!r}")
     if len(scene) == 0:
@@ -252,8 +249,9 @@ def evaluate(
         fog = measure_fog(*compared) if options.fog and outputs else {}
         num_pictures, numbers = len(scored) * sum(len(split.views) for split in splits.values()), count(1)
 
-        def report_image(name: str, kind: str, view: int, image: np.ndarray) -> None:
+        def report_image(name: str, kind: str, view: int, image: np.ndarray, alpha: np.ndarray) -> None:
             """Pass a rendered view to the caller, and report the progress."""
+            on_alpha(name, kind, view, alpha)
             on_image(name, kind, view, image)
             progress(f"evaluate: {name}", next(numbers), num_pictures)
 
@@ -271,6 +269,14 @@ def evaluate(
     counts = {name: len(split.scored) for name, split in splits.items()}
     notes = (*lpips_notes, *_describe_scores(splits, scores, mended=mended))
     return Evaluation(tuple(scores), _describe_references(splits), counts, notes, options, scene.images)
+
+
+def _default_options() -> tuple[EvaluateOptions, Sequence[str]]:
+    """Return the options of an evaluation that gives none, and a note on LPIPS if its weights are not installed."""
+    from gsmerge.scoring.lpips import installed_networks
+
+    nets, notes = installed_networks(EvaluateOptions().lpips)
+    return EvaluateOptions(lpips=nets), notes
 
 
 def _describe_references(splits: Mapping[str, _Split]) -> str:
@@ -360,7 +366,7 @@ def _score_split(
     cameras: Mapping[str, Cameras],
     marks: Mapping[str, bool],
     renderer: _Renderer,
-    on_image: OnImage,
+    on_image: Callable[[str, str, int, np.ndarray, np.ndarray], None],
 ) -> dict[str, list[tuple[float, ViewScore]]]:
     """Draw and score all results, one view after the other.
 
@@ -379,11 +385,11 @@ def _score_split(
         for name, gaussians in results.items():
             own_cameras = replace(moved.get(name, split.views.cameras), antialiased=marks[name])
             start = time.perf_counter()
-            image, is_opaque = renderer.draw(gaussians, own_cameras, view)
+            image, alpha = renderer.draw(gaussians, own_cameras, view)
             seconds = time.perf_counter() - start
-            on_image(name, kind, view, image)
+            on_image(name, kind, view, image, alpha)
             if name == INPUT and covered is None:
-                covered = is_opaque if split.masks is None else is_opaque & split.masks[view]
+                covered = (1 - alpha < COVERED_TRANSMITTANCE) & (split.masks is None or split.masks[view])
             score = ViewScore(kind, names[view], float(split.visible[view].mean()), Quality(), Quality())
             if view in split.scored:
                 score = _add_qualities(score, image, split, view, covered, nets)

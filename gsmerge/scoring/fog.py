@@ -18,8 +18,9 @@ import numpy as np
 from gsmerge.fit.report import HAZE
 from gsmerge.geometry.transforms import camera_depths, middle_depth, step_outside
 from gsmerge.geometry.views import pick_views
-from gsmerge.raster import Splats, make_splats, render, tile_view
+from gsmerge.raster import Splats, make_splats, render
 from gsmerge.raster.composite import blend_depths
+from gsmerge.raster.images import tile_camera
 from gsmerge.runtime.record import Progress
 from gsmerge.scoring.sizes import shrink_cameras
 from gsmerge.types import Cameras, Gaussians
@@ -142,8 +143,7 @@ def draw_depths(splats: Splats, camera: Cameras, near: float, depth_near: float)
 
     Depths are drawn with ``depth_near`` only. Both planes are in world units.
     """
-    values = camera.viewmats[0], camera.Ks[0], camera.width, camera.height
-    views = [tile_view(splats, *values, antialiased=camera.antialiased, near=plane) for plane in (near, depth_near)]
+    views = [tile_camera(splats, camera, 0, plane) for plane in (near, depth_near)]
     (_, transmittance), (depths, transmittance_beyond) = map(blend_depths, views)
     return OutsidePicture(1 - transmittance, 1 - transmittance_beyond, depths)
 

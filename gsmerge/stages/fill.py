@@ -20,9 +20,9 @@ from gsmerge.kernels.pictures import blur
 from gsmerge.prepare.fill_holes import NEW_SIZE_PIXELS, make_round_gaussians, pixel_rays
 from gsmerge.prepare.place_cameras import between_cameras
 from gsmerge.prepare.row_colors import fill_gaps
-from gsmerge.raster import Splats, TiledView, make_splats, tile_view
+from gsmerge.raster import Splats, make_splats
 from gsmerge.raster.composite import blend, blend_depths, view_colors
-from gsmerge.raster.photos import NEAR_PLANE
+from gsmerge.raster.images import tile_camera
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians
@@ -71,7 +71,7 @@ def fill_between(
     Ks = between.Ks + np.array([[0, 0, right], [0, 0, down], [0, 0, 0]])
     between = replace(between, Ks=Ks, width=width + 2 * right, height=height + 2 * down)
     drawings = parallel_map(lambda view: _draw(splats, between, view), range(len(between)))
-    depths = parallel_map(lambda view: blend_depths(_tile_camera(splats, cameras, view)), range(len(cameras)))
+    depths = parallel_map(lambda view: blend_depths(tile_camera(splats, cameras, view)), range(len(cameras)))
     seen_between = _find_seen(between, [drawing[:2] for drawing in drawings])
     # the cameras between the views contradict no Gaussian in a gap, because their gaps shall be filled
     farthest = np.where(seen_between.clear, np.float32(0), seen_between.farthest)
@@ -134,15 +134,9 @@ def lies_between(known: np.ndarray) -> np.ndarray:
     return np.asarray(masks[0] | masks[1].T)
 
 
-def _tile_camera(splats: Splats, cameras: Cameras, view: int) -> TiledView:
-    """Tile the Gaussians for a drawing by one of the cameras."""
-    camera = cameras.viewmats[view], cameras.Ks[view], cameras.width, cameras.height
-    return tile_view(splats, *camera, antialiased=cameras.antialiased, near=NEAR_PLANE)
-
-
 def _draw(splats: Splats, cameras: Cameras, view: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return what one camera sees: mean depths ``[h,w]``, transmittances ``[h,w]`` and colours ``[h,w,3]``."""
-    tiled = _tile_camera(splats, cameras, view)
+    tiled = tile_camera(splats, cameras, view)
     return *blend_depths(tiled), blend(tiled, view_colors(tiled), np.zeros(3, np.float32))[0]
 
 

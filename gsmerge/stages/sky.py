@@ -17,8 +17,8 @@ import numpy as np
 from gsmerge.geometry.transforms import correlation, is_inside, project
 from gsmerge.kernels.pictures import blur, sobel
 from gsmerge.kernels.raster.list_weights import LANES, collect, list_weights
-from gsmerge.raster import make_splats, tile_view
-from gsmerge.raster.photos import NEAR_PLANE
+from gsmerge.raster import make_splats
+from gsmerge.raster.images import tile_camera
 from gsmerge.types import Cameras, Gaussians
 
 GRADIENT_PIXELS = 480.0  # gradients are measured in a photo with GRADIENT_PIXELS on its longer side
@@ -63,9 +63,7 @@ def _mostly_inside(gaussians: Gaussians, cameras: Cameras, regions: Mapping[int,
     splats = make_splats(gaussians)
     inside, total = np.zeros(len(splats)), np.zeros(len(splats))
     for view, region in regions.items():
-        viewmat, K = cameras.viewmats[view].astype(np.float64), cameras.Ks[view].astype(np.float64)
-        camera = viewmat, K, cameras.width, cameras.height
-        tiled = tile_view(splats, *camera, antialiased=cameras.antialiased, near=NEAR_PLANE)
+        tiled = tile_camera(splats, cameras, view)
         image = np.zeros((*region.shape, LANES), np.float32)
         image[..., 0], image[..., 1] = region, 1
         sums = np.zeros((len(tiled.ids), LANES))  # of each Gaussian's weights times the channels of the image

@@ -19,16 +19,14 @@ from gsmerge.prepare.confirm_depths import Agreement, confirm_depths
 from gsmerge.prepare.fill_holes import large_parts
 from gsmerge.raster import render
 from gsmerge.raster.metrics import is_worse
-from gsmerge.raster.photos import NEAR_PLANE, WHOLE_SHARE
+from gsmerge.raster.photos import COVERED_TRANSMITTANCE, NEAR_PLANE, WHOLE_SHARE
 from gsmerge.runtime.record import Progress
 from gsmerge.runtime.threads import use_threads
 from gsmerge.scoring.evaluate import INPUT, EvaluateOptions, Evaluation, Quality, ResultScores, evaluate
 from gsmerge.scoring.lpips import lpips_available
-from gsmerge.scoring.sizes import shrink_cameras
 from gsmerge.types import Cameras, Gaussians, Scene, Views
 
 LPIPS = "alex"  # network of LPIPS, if its weights are installed; it takes 0.05 s per picture, "vgg" 0.8 s
-CUT_OUT_PIXELS = 128  # longer side of the pictures in which a cut-out is recognised
 MAX_SHOWN_VIEWS = 32  # most views in a page, chosen at equal intervals; each takes up to 300 kB
 SplitViews = tuple[Cameras, np.ndarray, Sequence[str]]  # cameras in the world, photos and names of a split
 Stills = dict[tuple[str, str, int], bytes]  # WebP, by result, split and view
@@ -133,26 +131,31 @@ def collect_page_data(
     only.
     """
     stills: Stills = {}
+    cut_out = set[tuple[str, int]]()  # split and number of the views in large parts of which the scene shows nothing
+    last_alpha = np.empty((0, 0))
 
-    shown_gaussians = {INPUT: scene.file_gaussians, **{name: gaussians.numpy() for name, gaussians in results.items()}}
-    small = shrink_cameras(scene.cameras.numpy(), CUT_OUT_PIXELS)
-    cut_out = any(large_parts(alpha[..., 0] < 0.5).any() for alpha in render(scene.gaussians.numpy(), small).alphas)
+    def keep_alpha(result: str, split: str, view: int, alpha: np.ndarray) -> None:
+        """Keep the alpha ``[h,w]`` of the next still, and see from that of the scene itself whether it is a cut-out."""
+        nonlocal last_alpha
+        last_alpha = alpha
+        if result == INPUT and large_parts(1 - alpha > COVERED_TRANSMITTANCE).any():
+            cut_out.add((split, view))
 
     def add_still(result: str, split: str, view: int, image: np.ndarray) -> None:
         """Keep the render ``[h,w,3]`` of a view of a split as an encoded still, of a cut-out on a chequered ground."""
-        if cut_out:
-            moved = (cameras or {}).get(result, scene.cameras)
-            of_split = moved if split == "context" or held_out is None else held_out.cameras
-            one = replace(of_split.numpy()[[view]], antialiased=moved.antialiased)
-            alpha = render(shown_gaussians[result], one, near=NEAR_PLANE * scene_frame(scene).unit).alphas[0, ..., 0]
-            image = lay_on_chequer(image, 1 - alpha)
+        if (split, view) in cut_out:
+            image = lay_on_chequer(image, 1 - last_alpha)
         stills[result, split, view] = encode_still(to_picture(image))
 
     options = EvaluateOptions((LPIPS,) if lpips_available(LPIPS) else (), None, fog=False)
-    evaluation = evaluate(scene, results, held_out, options, cameras=cameras, progress=progress, on_image=add_still)
+    evaluation = evaluate(
+        scene, results, held_out, options, cameras=cameras, progress=progress, on_image=add_still, on_alpha=keep_alpha
+    )
     progress("the view from outside", 0, 0)
     with use_threads():
-        data = _fill_page(title, scene, results, file_bytes, held_out, evaluation, stills, light=light, cut_out=cut_out)
+        data = _fill_page(
+            title, scene, results, file_bytes, held_out, evaluation, stills, light=light, cut_out=bool(cut_out)
+        )
     progress("done", 0, 0)
     gains, sides, notes = new_gains or {}, [], list[str]()
     for side in data.sides:

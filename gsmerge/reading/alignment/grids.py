@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -29,7 +29,6 @@ class Grid:
     camera_file: CameraFile  # the cameras as they are read, in one convention of the poses
     cameras: Cameras  # the same cameras at the size of the grid, in their own world
     transform: PhotoTransform | None  # transform of the photos to the grid; None: photos stay as they are
-    previews: bool = field(default=False, kw_only=True)  # the photos are much smaller than the grid, and are not used
     remarks: tuple[str, ...]  # notes for the user on this size, one sentence each
     moves: Sequence[dict[str, Any]] = ()  # how far each camera was moved to its Gaussians; empty if none was moved
     # ``[c,4,4]`` poses as read, if photos confirm them, so that the Gaussians have to move instead; otherwise None
@@ -37,6 +36,7 @@ class Grid:
     frame: Similarity = IDENTITY  # from the cameras' own world to the frame of the Gaussians
     shown_by: str = ""  # evidence for the frame, in words; empty for a frame that a file gives
     mismatch: SceneError | None = None  # what is wrong with cameras that had to be cropped, if the grid does not fit
+    previews: bool = False  # the photos are much smaller than the grid, and are not used
 
     @property
     def size(self) -> Size:

@@ -76,11 +76,11 @@ class MaskFiles:
         if photo is not None and self.canvas not in (None, image_size(photo)):
             whole = np.full(image_size(photo)[::-1], True)
             alpha = whole if alpha is None else alpha
-            inside = extend_picture(turn_picture(whole, self.turns[view]), image_size(photo), self.canvas)
+            inside = extend_picture(turn_picture(whole, self.turns[view]), self.canvas)
             importance = (self._reduce(inside * _WHITE, view) > 0).astype(np.float32)  # 0 beyond the photo
         if alpha is not None:
-            upright = turn_picture(alpha, self.turns[view])
-            opaque = cut_part(extend_picture(upright, upright.shape[1::-1], self.canvas), self.part) * _WHITE
+            upright = extend_picture(turn_picture(alpha, self.turns[view]), self.canvas)
+            opaque = cut_part(upright, self.part) * _WHITE
             counts = self._reduce(opaque, view) > min_level
         if (mask := self.masks[view]) is not None:
             levels = self._read_levels(mask, view)
@@ -105,7 +105,7 @@ class MaskFiles:
                 whole = turn_picture(whole, turns)
             upright = size[::-1] if turns % 2 else size
             if same_shape(upright, whole.shape[1::-1]):
-                whole = cut_part(extend_picture(whole, upright, self.canvas), self.part)
+                whole = cut_part(extend_picture(whole, self.canvas, upright), self.part)
         if not same_shape(self.stored, whole.shape[1::-1]):
             (width, height), (columns, lines) = self.stored, whole.shape[1::-1]
             problem = (

@@ -388,7 +388,7 @@ def _list_candidates(photos: ScenePhotos) -> Candidates:
         small = np.zeros((OFFSET_PIXELS, OFFSET_PIXELS, 3), np.float32)
         with suppress(SceneError):
             path = photos.pool[number]
-            small = extend_picture(decode_small(path, OFFSET_PIXELS), image_size(path), photos.canvas)
+            small = extend_picture(decode_small(path, OFFSET_PIXELS), photos.canvas, image_size(path))
         small = photos.fit.cut(small)
         return small if photos.grid_fit is None else photos.grid_fit.cut(small)
 
