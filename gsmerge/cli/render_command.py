@@ -3,7 +3,7 @@
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import print_document, say_notes, stage_progress
@@ -41,12 +41,7 @@ def parse_views(text: str) -> int | str:
 FRAMES = Setting("Number of frames of a clip, at 30 frames per second, or 12.5 in a GIF.", kind=int, least=2,
                  most=100_000)  # fmt: skip
 BACKGROUND = Setting("Grey level behind the scene, 0 to 1; or none: a .png or .webp of one scene is transparent, other "
-                     "pictures show a chequered ground.", kind=float, least=0, most=1)  # fmt: skip
-
-
-def parse_background(text: str) -> float | str:
-    """Parse ``--background``: a grey level, or "none"."""
-    return NONE if text == NONE else float(BACKGROUND.read(text))
+                     "pictures show a chequered ground.", kind=float | Literal["none"], least=0, most=1)  # fmt: skip
 
 
 def render(
@@ -69,7 +64,7 @@ def render(
         "equal intervals; or the name of one view, such as 00006 or 6.jpg (6 would be a number).",
         read=opt.reader(parse_views), default="4 on a panel, else all")] = None,
     background: Annotated[opt.Parsed | None, opt.option(opt.OUTPUT, "LEVEL|none", BACKGROUND.help,
-        default="none in a panel, else 0", read=opt.reader(parse_background))] = None,
+        default="none in a panel, else 0", read=opt.reader(BACKGROUND.read))] = None,
     overwrite: opt.Overwrite = False, threads: opt.OwnThreads = None, json: opt.Json = False,
     progress: opt.Progress = None, quiet: opt.Quiet = False,
 ) -> None:  # fmt: skip

@@ -206,7 +206,7 @@ def test_videos_of_odd_sides_are_made_even_with_a_note(
     [
         (("--views", "view_001"), "a.gif", ("--views", "number", "--path")), (("--views", "0"), "folder", ("--views",)),
         (("--views", "nine"), "a.png", ("--views nine", "view_000")),
-        (("--background", "nothing"), "folder", ("--background",)), (("--background", "2"), "folder", ()),
+        (("--background", "nothing"), "folder", ("--background", "or none")), (("--background", "2"), "folder", ()),
         (("--background", "nan"), "folder", ()),
     ],
 )  # fmt: skip
