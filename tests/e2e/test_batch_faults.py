@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 
 import pytest
-from batches import FAST, NAMES, PATIENCE, finish, holders, records, results, start, statuses, until
+from batches import FAST, NAMES, PATIENCE, finish, has_record, holders, records, results, start, statuses, until
 from messages import names
 from shared import write_scene
 
@@ -40,7 +40,7 @@ def _runs(pid: int) -> bool:
 def test_a_killed_run_goes_on_where_it_was(rooms: Path, tmp_path: Path, undisturbed: dict[str, str]) -> None:
     """What is recorded stays, what is not is done, once. No process of a run outlives it."""
     process = start(rooms, "--output", tmp_path, *FAST, "--jobs", 2)
-    workers = until(lambda: (tmp_path / "batch.jsonl").exists() and records(tmp_path) and holders(tmp_path), process)
+    workers = until(lambda: has_record(tmp_path) and holders(tmp_path), process)
     process.kill()
     process.communicate()
     assert not outlive(workers or [])
@@ -76,7 +76,7 @@ def test_ctrl_c_keeps_whole_results_that_the_next_run_completes(
 ) -> None:
     process = start(rooms, "--output", tmp_path, *FAST, "--jobs", 1)
     os.setpriority(os.PRIO_PROCESS, process.pid, 19)  # on a busy machine this side is to see the first scene done
-    until(lambda: (tmp_path / "batch.jsonl").exists() and records(tmp_path), process)
+    until(lambda: has_record(tmp_path), process)
     process.send_signal(signal.SIGINT)
     said, errors = process.communicate()
     assert process.returncode == 130

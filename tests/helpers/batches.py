@@ -29,6 +29,12 @@ def records(folder: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in (folder / RECORDS).read_text().splitlines()]
 
 
+def has_record(folder: Path) -> bool:
+    """Return whether a batch that still runs has written a record, whole: what follows it may be half a line."""
+    path = folder / RECORDS
+    return path.exists() and b"\n" in path.read_bytes()
+
+
 def statuses(folder: Path) -> dict[str, list[str]]:
     """Return what was recorded of every result, in order."""
     actual: dict[str, list[str]] = {}
