@@ -18,12 +18,12 @@ from gsmerge.raster.photos import COVERED_TRANSMITTANCE, counting_pixels
 from gsmerge.runtime.record import note
 from gsmerge.types import PicturedScene
 
-# All radii are in widths of a Gaussian, see measure_unit. Left-out pixels are empty in holes of the input of at least
+# These radii are in widths of a Gaussian, see measure_unit. Left-out pixels are empty in holes of the input of at least
 # the radius HOLE, and in the rim RIM around these holes, where Gaussians of an object reach over its edge. In a view
 # with a large empty part that no mask leaves out, as of an object, other holes are empty, too, and photos do not count
-# in the next RING pixels
+# in the next RING widths
 HOLE, RIM, RING = 3, 2, 3
-SOFT = 1  # width of the edge between a uniform background and an object, where the photo mixes both
+SOFT = 1  # pixels at the edge between a uniform background and an object, where the photo mixes both
 NOISE = np.float32(16 / 255)  # largest difference between the colour of a uniform background and a pixel of it
 LEAST_ALIKE = 0.95  # least share of the pixels of a uniform background that differ less
 SOLID = 0.95  # opacity of a picture from which on it shows an object, and not Gaussians that reach over its edge
@@ -49,7 +49,7 @@ def mask_background(scene: PicturedScene) -> PicturedScene:
             alpha = render(scene.gaussians, scene.cameras[[view]]).alphas[0, ..., 0]
             _, labels = cv2.connectedComponents(is_alike.astype(np.uint8), connectivity=4)
             around = np.isin(labels, labels[part & is_alike]) & _grow(alpha < SOLID, RIM * unit)
-            counts[view] &= ~_grow(around | (is_alike & bare[view]), SOFT * unit)
+            counts[view] &= ~_grow(around | (is_alike & bare[view]), SOFT)
             # contrast with a bright background would hide what the object shows where photos are compared
             inner = photo[counts[view]].mean(0) if counts[view].any() else photo[part].mean(0)
             images[view] = np.where(counts[view][..., None], photo, inner)
@@ -91,11 +91,13 @@ def draw_left_out(scene: PicturedScene, masks: np.ndarray | None) -> PicturedSce
 
 
 def measure_unit(scene: PicturedScene) -> float:
-    """Return how many pixels wide a Gaussian is in the views, if all pixels that show some were shared out; at least 1.
+    """Return how many pixels wide a Gaussian in front is in a view, in the median view; at least 1.
 
     Views may have far more pixels than a model made Gaussians from.
     """
-    return max(1.0, float(np.sqrt(scene.get_pixels().shown.sum() / len(scene.gaussians))))
+    fronts = [front[front >= 0] for front in scene.get_pixels().fronts]
+    widths = [np.sqrt(front.size / np.unique(front).size) for front in fronts if front.size]
+    return max(1.0, float(np.median(widths))) if widths else 1.0
 
 
 def _grow(mask: np.ndarray, radius: float) -> np.ndarray:

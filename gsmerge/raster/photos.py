@@ -17,7 +17,7 @@ from gsmerge.raster.metrics import MAX_PSNR, psnr_within
 from gsmerge.raster.tiled_view import EPS2D, Splats, make_splats, tile_view
 from gsmerge.runtime.memory import make_array
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.types import Cameras, Gaussians, PicturedScene, Scene
+from gsmerge.types import Cameras, Gaussians, Scene
 
 Score = TypeVar("Score")
 
@@ -179,9 +179,10 @@ def with_pixel_values(photos: Photos, scene: Scene) -> Photos:
     return replace(photos, weights=pixel_weights(scene.masks, *size), importance=important)
 
 
-def counting_pixels(scene: PicturedScene) -> np.ndarray:
+def counting_pixels(scene: Scene) -> np.ndarray:
     """Return the mask ``[v,h,w]`` of the pixels that count: the scene's masks, without masks all."""
-    return np.full(scene.images.shape[:3], True) if scene.masks is None else scene.masks
+    shape = len(scene), scene.cameras.height, scene.cameras.width
+    return np.full(shape, True) if scene.masks is None else scene.masks
 
 
 def pixel_weights(masks: np.ndarray | None, width: int, height: int) -> np.ndarray | None:

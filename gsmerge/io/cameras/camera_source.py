@@ -63,6 +63,7 @@ class StoredCameras(NamedTuple):
     images: PhotoArrays = ()  # ``[c,h,w,3]`` uint8 sRGB; empty without any
     order: str = "auto"  # order of the Gaussians' rows
     convention: Convention | None = None  # convention of the poses if it differs from that of the format
+    counts: np.ndarray | None = None  # ``[c,h,w]`` bool, where ``images`` count; None: everywhere
 
 
 @contextmanager

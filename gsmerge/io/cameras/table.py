@@ -55,7 +55,8 @@ class CameraFormat:
         """Read the cameras of a file; raise SceneError if the file is damaged or incomplete."""
         stored = read_views(source, self.read) if isinstance(self.read, ViewLayout) else self.read(source)
         convention = stored.convention or self.convention
-        return make_camera_file(source.path, self.name, convention, stored.views, stored.images, stored.order)
+        camera_file = make_camera_file(source.path, self.name, convention, stored.views, stored.images, stored.order)
+        return replace(camera_file, counts=stored.counts)
 
 
 def is_colmap(folder: Path) -> bool:

@@ -142,12 +142,14 @@ def _parse_header(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
 
 
 def write_scene(path: StrPath, scene: Scene, about: Mapping[str, Any], *, overwrite: bool, mode: int) -> None:
-    """Write a scene without pixels: its Gaussians, cameras, pictures as uint8, and facts ``about`` it as JSON."""
+    """Write a scene without pixels: Gaussians, cameras, pictures as uint8, masks, and facts ``about`` it as JSON."""
     arrays = {name: np.asarray(column, np.float32) for name, column in vars(scene.gaussians).items()}
     cameras = scene.cameras
     arrays |= {name: np.asarray(getattr(cameras, name), np.float64) for name in ("viewmats", "Ks")}
     if scene.images is not None:
         arrays["images"] = np.rint(255 * scene.images.clip(0, 1)).astype(np.uint8)
+    if scene.masks is not None:
+        arrays["masks"] = scene.masks
     header = {"kind": SCENE, "width": cameras.width, "height": cameras.height, "names": list(scene.names)}
     write_gsm(path, header | {"about": dict(about)}, arrays, overwrite=overwrite, mode=mode)
 
@@ -206,16 +208,18 @@ def holds_views(path: Path) -> bool:
 
 
 def read_views(source: CameraSource) -> StoredCameras:
-    """Read the cameras and pictures of a ``.gsm`` of results; raise SceneError if some are missing or damaged."""
+    """Read the cameras, pictures and masks of a ``.gsm`` of results; SceneError if some are missing or damaged."""
     file = read_gsm(source.path)
     cameras = stored_cameras(file)
     names = stored_names(file, len(cameras))
     size = cameras.width, cameras.height
-    images = file.array("images", np.uint8, len(cameras), cameras.height, cameras.width, 3)
+    shape = len(cameras), cameras.height, cameras.width
+    images = file.array("images", np.uint8, *shape, 3)
+    counts = file.array("masks", np.bool_, *shape) if "masks" in file.arrays else None
     views = [
         StoredView(name, viewmat, K, size) for name, viewmat, K in zip(names, cameras.viewmats, cameras.Ks, strict=True)
     ]
-    return StoredCameras(views, images, order="none")
+    return StoredCameras(views, images, order="none", counts=counts)
 
 
 def stored_names(file: GsmFile, num_views: int) -> tuple[str, ...]:

@@ -14,12 +14,13 @@ from gsmerge.geometry.views import camera_kinds, concat_cameras, in_float64, res
 from gsmerge.io.photo_files import photo_array
 from gsmerge.prepare.confirm_depths import CHANCE_ERRORS, NORMAL_SAMPLES
 from gsmerge.prepare.prepare_scene import Prepared
-from gsmerge.raster.photos import shrink_pictures
+from gsmerge.raster.photos import counting_pixels, shrink_pictures
 from gsmerge.reading.alignment import check_cameras
 from gsmerge.results.outputs import join_gaussians
 from gsmerge.road import compact_prepared, plan_run
 from gsmerge.runtime.record import Progress, record_run
 from gsmerge.runtime.threads import use_threads
+from gsmerge.scoring.sizes import resize_mask
 from gsmerge.settings.compact import ONE_PIECE, CompactOptions
 from gsmerge.settings.extend import ExtendOptions
 from gsmerge.types import Cameras, Gaussians, Scene
@@ -146,8 +147,9 @@ def _keep_pictures(prepared: Prepared) -> Scene:
     first_layers = np.unique(camera_kinds(input_scene.cameras), return_index=True)[1]
     views = sorted(first_layers.tolist())
     images = prepared.scene.images[[prepared.repeated[view] for view in views]]
+    masks = None if prepared.scene.masks is None else prepared.scene.masks[[prepared.repeated[view] for view in views]]
     cameras = in_float64(input_scene.cameras[views])
-    return Scene(no_gaussians, cameras, images, None, tuple(input_scene.names[view] for view in views))
+    return Scene(no_gaussians, cameras, images, None, tuple(input_scene.names[view] for view in views), masks=masks)
 
 
 def _join_views(before: Scene, batch: Scene) -> Scene:
@@ -160,14 +162,17 @@ def _join_views(before: Scene, batch: Scene) -> Scene:
     size = before.cameras.width, before.cameras.height
     assert before.images is not None
     assert batch.images is not None
-    images, cameras = batch.images, batch.cameras
+    images, cameras, counts = batch.images, batch.cameras, counting_pixels(batch)
     if images.shape[2:0:-1] != size:
         images = shrink_pictures(images, *size)
         cameras = resize_cameras(cameras, *size)
+        counts = np.stack([resize_mask(mask, *size) for mask in counts])
+    all_counts = np.concatenate([counting_pixels(before), counts])
     return replace(
         before,
         cameras=concat_cameras(before.cameras, cameras),
         images=np.concatenate([before.images, images]),
+        masks=None if all_counts.all() else all_counts,
         names=append_names(before.names, batch.names),
     )
 

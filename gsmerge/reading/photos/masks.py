@@ -66,12 +66,14 @@ class MaskFiles:
     stored: Size  # size of this part
     cut: Callable[[int, np.ndarray], np.ndarray]  # view, picture of the size ``stored`` -> what the view shows of it
     cameras: Cameras
+    stored_counts: np.ndarray | None = None  # [v,h,w] bool, where photos inside another file count; None: everywhere
 
     def read(self, view: int) -> tuple[np.ndarray | None, np.ndarray | None]:
         """Read which pixels ``[h,w]`` of a view count, and their weights ``[h,w]``; None: all count, with weight 1."""
         photo, counts = self.photos[view] if self.photos else None, None
         importance: np.ndarray | None = None
         alpha = None if photo is None else decode_alpha(photo)
+        alpha = alpha if self.stored_counts is None else self.stored_counts[view]
         min_level = 191  # level of 255; a pixel counts if three quarters of the file's pixels in it count
         if photo is not None and self.canvas not in (None, image_size(photo)):
             whole = np.full(image_size(photo)[::-1], True)
@@ -165,7 +167,8 @@ def read_masks(
 
     masks, protecting = list_by_view(photo_masks), list_by_view(photo_protecting)
     turns = photos.turns or (0,) * len(masks)
-    mask_files = MaskFiles(tuple(paths), turns, masks, protecting, photos.fit.part, photos.canvas, stored, cut, cameras)
+    part, canvas, stored_counts = photos.fit.part, photos.canvas, None if paths else camera_file.counts
+    mask_files = MaskFiles(tuple(paths), turns, masks, protecting, part, canvas, stored, cut, cameras, stored_counts)
     counts, importance = zip(*parallel_map(mask_files.read, range(len(masks))), strict=True)
     error, place = (CameraMaskError, camera_file.path) if by_cameras else (SceneError, files.masks or "")
     _refuse_photos(error, place, "masks", masks, photos.pictures)

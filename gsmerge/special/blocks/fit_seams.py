@@ -102,7 +102,12 @@ def join_views(scene_views: Sequence[tuple[PicturedScene, list[int]]]) -> Pictur
             num_copied += 1
         free_pages([scene.images, images])
     joined = concat_scenes([subset(scene.without_pictures(), ids) for scene, ids in scene_views], images)
-    return PicturedScene.with_pictures(replace(joined, cameras=in_float64(joined.cameras)), images, joined.masks)
+    pictured = PicturedScene.with_pictures(replace(joined, cameras=in_float64(joined.cameras)), images, joined.masks)
+    if all(scene.empty is None for scene, _ in scene_views):
+        return pictured
+    no_pixel = np.zeros(images.shape[1:3], np.float32)
+    empty = [no_pixel if scene.empty is None else scene.empty[view] for scene, ids in scene_views for view in ids]
+    return replace(pictured, empty=np.stack(empty))
 
 
 def _view_weights(splats: Splats, starts: Sequence[BlockStart]) -> Iterator[tuple[int, int, np.ndarray, np.ndarray]]:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import scenes
 
-from gsmerge import Gaussians, Scene, compact, render
+from gsmerge import Compactor, Gaussians, Scene, compact, render
 from gsmerge.prepare.prepare_scene import prepare
 from gsmerge.raster.metrics import decibels
 
@@ -96,3 +97,37 @@ def test_photos_of_an_object_are_compared_without_their_background(ball: Scene, 
         assert prepared.scene.masks is not None
         assert not (prepared.scene.masks & ~inside).any()
         assert prepared.scene.masks[inside].mean() > 0.6
+
+
+@pytest.mark.parametrize("way", ["blocks", "state", "state read from its file"])
+def test_what_is_empty_stays_empty_in_blocks_and_states(way: str, ball: Scene, room: Scene, tmp_path: Path) -> None:
+    """Blocks share views where they meet, and a state keeps which pixels of its pictures count."""
+    alphas = render(ball.gaussians, ball.cameras).alphas[..., 0]
+    inside = alphas > 0.5
+    photos = np.where(inside[..., None], room.images, np.float32(0))
+    scene = replace(scenes.shown_in(room, inside), images=photos, masks=inside)
+    if way == "blocks":
+        result = compact(scene, **FIT, blocks=2)
+    else:
+        compactor = Compactor(superpixels=200, checkpoint="none")
+        compactor.extend(scenes.take_views(scene, [0, 1]))
+        compactor.extend(scenes.take_views(scene, [2, 3]))
+        if "file" in way:
+            compactor.save(tmp_path / "ball.gsm")
+            compactor = Compactor.load(tmp_path / "ball.gsm")
+        result = compactor.compact(**FIT)
+    drawn = render(result.gaussians, room.cameras)
+    assert drawn.alphas[..., 0][alphas < 0.02].mean() < 0.02
+    assert over_both(result.gaussians, ball) > 22
+
+
+def test_large_gaussians_do_not_eat_the_edge_of_an_object(ball: Scene) -> None:
+    """As in trained objects and results: the edge of the photo is as sharp as before."""
+    alphas = render(ball.gaussians, ball.cameras).alphas
+    large = compact(
+        replace(ball, images=ball.images, masks=alphas[..., 0] > 0.5), **FIT | {"superpixels": 60}
+    ).gaussians
+    prepared = prepare(replace(ball, gaussians=large, images=ball.images + 1 - alphas))
+    assert prepared.scene.masks is not None
+    solid = alphas[..., 0] > 0.95
+    assert prepared.scene.masks[solid].mean() > 0.9
