@@ -74,15 +74,17 @@ def draw_left_out(scene: PicturedScene, masks: np.ndarray | None) -> PicturedSce
     bare = transmittance > COVERED_TRANSMITTANCE
     if scene.beyond is not None:  # nothing is known there
         bare &= ~scene.beyond
+    solid = np.zeros_like(bare)
     if scene.has_own_pixels:  # pictures already have the colours of the views' own Gaussians, which are solid
         colors, transmittance = scene.images.copy(), np.zeros_like(transmittance)
+        solid = scene.get_pixels().shown & (scene.gaussians.opacities[scene.get_pixels().fronts] > BARE)
     for view, hole in enumerate(holes):
         left_out = np.zeros(hole.shape, bool) if masks is None else ~masks[view]
         nothing = _grow(~_grow(~bare[view], HOLE * unit), HOLE * unit)
         cut = (hole | nothing if hole.any() else hole) & ~left_out
         counts[view] &= ~_grow(cut, RING * unit)
         left_out |= cut
-        is_empty = (hole | _grow(nothing & left_out, RIM * unit)) & left_out
+        is_empty = (hole | (_grow(nothing & left_out, RIM * unit) & ~solid[view])) & left_out
         colors[view][is_empty], transmittance[view][is_empty] = 0, 1
     changes = [PhotoChange(cover=~counting, colors=picture) for counting, picture in zip(counts, colors, strict=True)]
     images = np.stack([change(photo) for change, photo in zip(changes, scene.images, strict=True)])
