@@ -240,7 +240,7 @@ class Views(ArrayFields):
 
 
 PROTECTED = np.float32(4)  # importance of a pixel that is white in a picture of --protect
-PER_PIXEL = ("images", "masks", "importance")  # arrays of a scene with a value for each pixel of its views
+PER_PIXEL = ("images", "masks", "importance", "depths")  # arrays of a scene with a value for each pixel of its views
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -346,6 +346,7 @@ class Scene(ArrayFields):
         importance: ``[v,h,w]`` float32, how many pixels each pixel counts for in a fit; None: one each.
         filled: ``[n]`` bool, True for Gaussians that are not in the file, and were added to fill holes; None: no
             Gaussians were added.
+        depths: ``[v,h,w]`` depth maps of the views, in any unit, which fill holes; None: none are known.
         region: The scene has no Gaussians outside of this region, as after a crop; None: no limit.
         notes: Notes from reading the files, for the report of a run; some are doubts.
 
@@ -369,6 +370,7 @@ class Scene(ArrayFields):
     filled: np.ndarray | None = None
     region: Region | None = None
     notes: tuple[str, ...] = ()
+    depths: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         if self.cameras is None:

@@ -1,9 +1,9 @@
 """Fill the holes of an export: add Gaussians at pixels that no Gaussian covers.
 
 Exporters drop borders, far regions and faint rows, and voxels have gaps. Each view is drawn from its own camera. Each
-empty pixel of the drawing gets a Gaussian with the colour of the picture. The new Gaussian gets the depth of the
-surface beside the pixel, or a depth beyond the view's farthest surface. The depth at which the pictures of the nearest
-other views agree best is chosen.
+empty pixel of the drawing gets a Gaussian with the colour of the picture. The new Gaussian gets the depth of the view's
+depth map, if the model wrote one. Otherwise it gets the depth of the surface beside the pixel, or a depth beyond the
+view's farthest surface: the one at which the pictures of the nearest other views agree best.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from gsmerge.geometry.transforms import lies_inside, nearest_views, rgb_to_sh0
+from gsmerge.geometry.transforms import camera_depths, lies_inside, nearest_views, rgb_to_sh0
 from gsmerge.kernels.matrices import invert, matmul
 from gsmerge.kernels.pictures import blur
 from gsmerge.kernels.reproject import add_differences
@@ -83,8 +83,10 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = Fa
             window = np.ones((gap, gap), np.uint8)
             holes[view] &= cv2.morphologyEx(covered.astype(np.uint8), cv2.MORPH_CLOSE, window) > 0
         if covered.any() and holes[view].any():
-            beside = fill_gaps(depths[..., None], covered)[..., 0][holes[view]]
-            edges[view] = _Edges(beside, float(np.quantile(depths[covered], FARTHEST_QUANTILE)))
+            beside = fill_gaps(depths[..., None], covered)[..., 0]
+            known = _fit_map(scene, view)
+            farthest = float(np.quantile(depths[covered], FARTHEST_QUANTILE))
+            edges[view] = _Edges(beside[holes[view]], farthest, None if known is None else known[holes[view]])
 
     tile_views(scene, find_holes, views)
     if edges and np.count_nonzero(bare[views]) < MOST_EMPTY * np.count_nonzero(~empty[views]):
@@ -128,6 +130,27 @@ class _Edges:
 
     beside: np.ndarray  # [n] depth of the surface beside each hole
     farthest: float  # Depth of the view's farthest surface
+    known: np.ndarray | None = None  # [n] depth of each hole in the view's depth map, NaN without one
+
+
+def _fit_map(scene: PicturedScene, view: int) -> np.ndarray | None:
+    """Bring a view's depth map to the unit of the scene; return ``[h,w]``, NaN where it has no depth.
+
+    None without a map, or if the map explains the depths of the view's Gaussians no better than one depth for all of
+    them does: it does not belong to the view.
+    """
+    if scene.depths is None:
+        return None
+    known, fronts = scene.depths[view].astype(np.float64), scene.get_pixels().fronts[view]
+    known[~(np.isfinite(known) & (known > 0))] = np.nan
+    both = (fronts >= 0) & np.isfinite(known)
+    if not both.any():
+        return None
+    depths = camera_depths(scene.gaussians.means[fronts[both]].astype(np.float64), scene.cameras.viewmats[view])
+    ratios, usual = depths / known[both], np.median(depths)
+    unit = np.median(ratios)
+    explains = np.median(np.abs(ratios / unit - 1)) < np.median(np.abs(depths / usual - 1))
+    return known * unit if explains else None
 
 
 def large_parts(empty: np.ndarray) -> np.ndarray:
@@ -176,8 +199,9 @@ def _leave_empty(scene: PicturedScene, empty: np.ndarray) -> PicturedScene:
 def _fill_view(scene: PicturedScene, view: int, holes: np.ndarray, edges: _Edges) -> Gaussians:
     """Make a Gaussian for each pixel of a view in the mask ``holes [h,w]``.
 
-    The depth is chosen at which the nearest other views show the same colour. Differences of colours are averaged over
-    neighbouring holes. If no other view sees the points of a ray, the depth of the surface beside the hole is chosen.
+    Where no depth is known, that is chosen at which the nearest other views show the same colour. Differences of
+    colours are averaged over neighbouring holes. If no other view sees the points of a ray, the depth of the surface
+    beside the hole is chosen.
     """
     cameras, centres, eye = scene.cameras, scene.cameras.centres, scene.cameras.centres[view]
     rays = pixel_rays(holes, cameras.Ks[view], cameras.viewmats[view])
@@ -202,7 +226,16 @@ def _fill_view(scene: PicturedScene, view: int, holes: np.ndarray, edges: _Edges
         cost = np.where(number > min_weight, total / np.maximum(number, min_weight), np.inf) + min_gain * step
         best_depths, best_costs = np.where(cost < best_costs, depth, best_depths), np.minimum(cost, best_costs)
     size = NEW_SIZE_PIXELS / cameras.Ks[view, 0, 0]
-    return make_round_gaussians(eye, rays, best_depths, size, colors, scene.gaussians.shN.shape[1])
+    if edges.known is None:
+        return make_round_gaussians(eye, rays, best_depths, size, colors, scene.gaussians.shN.shape[1])
+    farthest, fronts = edges.farthest * FACTORS[-1], scene.get_pixels().fronts[view]
+    best_depths = np.where(np.isfinite(edges.known), np.minimum(edges.known, farthest), best_depths)
+    added = make_round_gaussians(eye, rays, best_depths, size, colors, scene.gaussians.shN.shape[1])
+    # the model would have made a Gaussian as beside the hole
+    like = scene.gaussians[fill_gaps(fronts[..., None], fronts >= 0)[..., 0][holes]]
+    scale = best_depths / camera_depths(like.means.astype(np.float64), cameras.viewmats[view])
+    scales = (scale[:, None] * like.scales).astype(np.float32)
+    return replace(added, quats=like.quats, scales=scales, opacities=like.opacities)
 
 
 def pixel_rays(mask: np.ndarray, K: np.ndarray, viewmat: np.ndarray) -> np.ndarray:

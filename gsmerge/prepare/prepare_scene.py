@@ -142,7 +142,7 @@ def prepare(
     superpixels need. Raises ValueError if there is no finite Gaussian, or if there are images without cameras.
     """
     options = options or PrepareOptions()
-    input_scene, placed = scene, len(scene) == 0
+    input_scene, placed = replace(scene, depths=None), len(scene) == 0  # depth maps serve for holes alone
     scene, repeated, notes = without_repeats(scene)
     for text in notes:
         note(text)
@@ -168,7 +168,8 @@ def prepare(
         views, shown, masks = reference.score_views, np.zeros(scene.images.shape[:3], bool), scene.masks
         has_row_colors = reference.name == ROW_COLORS  # these pictures have colours at all pixels
         shown[list(views)] = True if has_row_colors or masks is None else masks[list(views)]
-        scene = draw_left_out(fill_holes(scene, shown, everywhere=options.extent == "photos"), masks)
+        scene = fill_holes(scene, shown, everywhere=options.extent == "photos")
+        scene = draw_left_out(replace(scene, depths=None), masks)
         if scene.empty is not None and scene.masks is not None:  # views that count nowhere any more are not scored
             seen = tuple(view for view in views if scene.masks[view].any())
             reference = replace(reference, score_views=seen or views)

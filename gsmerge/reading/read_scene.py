@@ -429,7 +429,11 @@ def _add_larger_and_masks(load: Loaded) -> Loaded:
     counts = masks.counts
     if scene.masks is not None:  # some views have no photo, and none of their pixels count
         counts = scene.masks if counts is None else counts & scene.masks
-    scene = replace(scene, large_photos=large, masks=counts, importance=masks.importance)
+    maps = source.camera_file.depths  # of the model, which saw the views at their own size
+    depths = (
+        maps if maps is not None and maps.shape == (len(scene), scene.cameras.height, scene.cameras.width) else None
+    )
+    scene = replace(scene, large_photos=large, masks=counts, importance=masks.importance, depths=depths)
     return replace(load, scene=scene, source=None, notes=(*load.notes, *notes, *mask_notes, *check_notes))
 
 

@@ -56,8 +56,7 @@ def read_da3(source: CameraSource) -> StoredCameras:
     Raise SceneError if the file cannot be read or lacks an array.
     """
     path = source.path
-    size_names = () if holds_images(path) else _DEPTHS  # without images, the shape of depth maps gives the size
-    arrays = read_arrays(path, {*_EXTRINSICS, *_INTRINSICS, *_IMAGES, *size_names})
+    arrays = read_arrays(path, {*_EXTRINSICS, *_INTRINSICS, *_IMAGES, *_DEPTHS})
     poses, Ks, images, depths = (
         next((arrays[name] for name in names if name in arrays), None)
         for names in (_EXTRINSICS, _INTRINSICS, _IMAGES, _DEPTHS)
@@ -79,7 +78,10 @@ def read_da3(source: CameraSource) -> StoredCameras:
         width, height = round(2 * Ks[0, 0, 2]), round(2 * Ks[0, 1, 2])
     if width <= 1 and Ks is not None and not is_da3(path):  # AnySplat divides intrinsics by the size
         return StoredCameras(_make_views(poses, Ks, (0, 0)), photos, convention=C2W_OPENCV)
-    return StoredCameras(_make_views(poses, Ks, (width, height)), photos)
+    shape = len(poses), height, width
+    if depths is not None:  # others than maps of these views fill no holes
+        depths = depths.reshape(shape) if depths.dtype.kind == "f" and depths.size == math.prod(shape) else None
+    return StoredCameras(_make_views(poses, Ks, (width, height)), photos, depths=depths)
 
 
 def read_views_npz(source: CameraSource) -> StoredCameras:

@@ -56,7 +56,7 @@ class CameraFormat:
         stored = read_views(source, self.read) if isinstance(self.read, ViewLayout) else self.read(source)
         convention = stored.convention or self.convention
         camera_file = make_camera_file(source.path, self.name, convention, stored.views, stored.images, stored.order)
-        return replace(camera_file, counts=stored.counts)
+        return replace(camera_file, counts=stored.counts, depths=stored.depths)
 
 
 def is_colmap(folder: Path) -> bool:

@@ -10,6 +10,7 @@ import pytest
 import scenes
 from exports import da3_rows, export_rows, save_export, smooth_scene
 from messages import noted
+from tiny_scene import write_npz
 
 from gsmerge import compact
 from gsmerge.geometry.transforms import camera_depths, rgb_to_sh0
@@ -188,3 +189,29 @@ def test_shares_of_a_budget_do_not_count_filled_gaussians() -> None:
     scene = without_pixels(make_walls())
     count = len(scene.gaussians)
     assert len(compact(scene, budget="10%", fill=True, effort="draft").gaussians) == round(0.1 * count)
+
+
+def test_depth_maps_of_the_model_fill_what_it_dropped(tmp_path: Path) -> None:
+    """In whatever unit they are. A map that does not belong to the views, or has no depth, changes nothing."""
+    tiny = smooth_scene(96, 72)
+    folder = save_export(tmp_path, tiny, export_rows(tiny, da3_rows(tiny)), cameras=False)
+    dropped = ~np.isin(np.arange(tiny.depths.size), da3_rows(tiny)).reshape(tiny.depths.shape)
+
+    def errors_of(maps: np.ndarray) -> np.ndarray:
+        """Return by which share the depths of what is filled differ from the truth."""
+        write_npz(folder / "results.npz", tiny, depth=maps.astype(np.float32))
+        prepared = prepare(load_scene(folder).scene)
+        scene, found = prepared.scene, []
+        assert scene.depths is None
+        for view, fronts in enumerate(scene.get_pixels().fronts):
+            means = prepared.frame.leave(scene.gaussians).means[fronts[dropped[view] & (fronts >= 0)]]
+            depths = camera_depths(means.astype(np.float64), prepared.input_scene.cameras.viewmats[view])
+            found.append(np.abs(depths / tiny.depths[view][dropped[view] & (fronts >= 0)] - 1))
+        return np.concatenate(found)
+
+    right, guessed = errors_of(1.7 * tiny.depths), errors_of(np.full_like(tiny.depths, np.nan))
+    wrong = errors_of(
+        np.random.default_rng(0).permuted(tiny.depths.reshape(len(tiny.depths), -1), axis=1).reshape(tiny.depths.shape)
+    )
+    assert np.median(right) < 0.01 < np.median(guessed)
+    np.testing.assert_array_equal(wrong, guessed)
