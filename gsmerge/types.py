@@ -441,7 +441,7 @@ class Scene(ArrayFields):
 
     @property
     def beyond(self) -> np.ndarray | None:
-        """Mask ``[v,h,w]`` of what lies beyond photos that were extended, which have no importance; None if nothing."""
+        """Mask ``[v,h,w]`` of pixels without importance, beyond photos or at edges that a photo mixes; None if none."""
         return None if self.importance is None else self.importance == 0
 
     @property

@@ -20,9 +20,12 @@ def extend(
     state: Annotated[Path, opt.argument("STATE", "A .gsm file; the first batch creates it.", opt.read_path)],
     scenes: Annotated[list[Path], opt.argument("SCENE...", "Batches of new views, in order; each is a scene as compact "
         "takes it.")],
-    cameras: opt.Cameras = None, images: opt.Images = None, hint: opt.Hint = None, dry_run: opt.DryRun = False,
-    set: Annotated[list[str] | None, opt.settings_option(SETTINGS, example="budget=2%")] = None,
-    threads: opt.Threads = None, json: opt.Json = False, progress: opt.Progress = None, quiet: opt.Quiet = False,
+    cameras: opt.Cameras = None, images: opt.Images = None, hint: opt.Hint = None, masks: opt.Masks = None,
+    budget: opt.Budget = None,
+    effort: Annotated[str | None, opt.setting_option(opt.METHOD, "draft|fast|default|best", "effort", "draft")] = None,
+    set: Annotated[list[str] | None, opt.settings_option(SETTINGS, example="superpixels=2000")] = None,
+    dry_run: opt.DryRun = False, threads: opt.Threads = None, json: opt.Json = False, progress: opt.Progress = None,
+    quiet: opt.Quiet = False,
 ) -> None:  # fmt: skip
     """Compact new views and add them to a state, from which gsmerge compact makes a result at any time."""
     from gsmerge.io.formats.table import STATE_ENDING
@@ -32,14 +35,14 @@ def extend(
     if state.suffix.lower() != STATE_ENDING:
         raise UsageError(f"{state}: expected a state whose name ends in {STATE_ENDING}")
     reading = opt.read_hints(hint)
-    if len(scenes) > 1 and {cameras, images} - {None, NONE}:
-        raise UsageError("--cameras and --images: expected one batch with them, got several; add one batch at a time")
+    if len(scenes) > 1 and {cameras, images, masks} - {None, NONE}:
+        raise UsageError("--cameras, --images and --masks: expected one batch, got several; add one batch at a time")
     from gsmerge.jobs.states.files import batch_line, extend_file
 
-    given = opt.read_settings(SETTINGS, set, threads=threads)
+    given = opt.read_settings(SETTINGS, set, budget=budget, effort=effort, threads=threads)
     with given.usage_errors():
         batch_settings(given.values)
-    batches = [find_scene_files(scene, cameras=cameras, images=images) for scene in scenes]
+    batches = [find_scene_files(scene, cameras=cameras, images=images, masks=masks) for scene in scenes]
     for files in batches:
         if any(path.resolve() == state.resolve() for path in input_files(files)):
             raise UsageError(f"{state}: expected a state other than the input; name another file")

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from gsmerge.drawing.camera_path import outside_camera
 from gsmerge.errors import SceneError
 from gsmerge.io import atomic_output
+from gsmerge.io.photo_files import mark_drawn
 from gsmerge.raster import render
 from gsmerge.raster.metrics import psnr, psnr_words
 from gsmerge.raster.photos import COVERED_TRANSMITTANCE, WHOLE_SHARE
@@ -63,6 +64,8 @@ def save_picture(path: Path, picture: BytePicture, *, overwrite: bool = True) ->
         raise SceneError(path, problem, "name a .png, or lower --size")
     channels = [2, 1, 0, 3][: picture.shape[-1]]  # the order of OpenCV
     _, data = cv2.imencode(path.suffix, np.ascontiguousarray(picture[..., channels]))
+    if path.suffix.lower() == ".png":
+        data = mark_drawn(data)
     with atomic_output(path, overwrite=overwrite) as temporary:
         temporary.write_bytes(data.tobytes())
 
@@ -101,6 +104,7 @@ def view_pictures(
     photos: Sequence[np.ndarray | None] | None = None,
     names: Sequence[str] | None = None,
     *,
+    masks: Sequence[np.ndarray] | None = None,
     marks: Sequence[bool | None] | None = None,
     background: float | None = 0.0,
 ) -> list[list[tuple[str, BytePicture]]]:
@@ -109,8 +113,9 @@ def view_pictures(
     A row begins with the photo ``[h,w,3]``, or with a dark picture if the photo is None. If ``photos`` is None, rows
     have scenes only. The text of a photo has the name of the view. The text of a render has the scene's name, its
     number of Gaussians, and the PSNR against the photo or, if ``photos`` is None, against the render of the first
-    scene. ``marks`` say which scenes are drawn antialiased; None: as the cameras say. If ``background`` is None,
-    pictures lie on a chequered ground, and PSNR are measured where the first scene shows something.
+    scene. ``masks [h,w]`` say which pixels of the photos count; None: all. ``marks`` say which scenes are drawn
+    antialiased; None: as the cameras say. If ``background`` is None, pictures lie on a chequered ground, and PSNR are
+    measured where the first scene shows something.
     """
     drawn = [
         render(gaussians, cameras, background or 0.0, antialiased=mark)
@@ -131,6 +136,8 @@ def view_pictures(
             covered = 1 - drawn[0].alphas[row, ..., 0] < COVERED_TRANSMITTANCE
             mask = covered if background is None and 0 < covered.mean() < WHOLE_SHARE else None
             name += "" if mask is None else ", where the scene is"
+            if masks is not None and photo is not None and not masks[row].all():
+                mask, name = masks[row], "the photo, where it counts"
             columns[1:] = [(f"{text}, {psnr_words(psnr(im, reference, mask))} to {name}", im) for text, im in compared]
         if background is None:
             shown = [lay_on_chequer(one.images[row], 1 - one.alphas[row, ..., 0]) for one in drawn]

@@ -40,6 +40,7 @@ from gsmerge.io.cameras.read_cameras import read_sharp_camera
 from gsmerge.io.formats.read_gaussians import FileInfo
 from gsmerge.io.image_names import IMAGE_SUFFIXES
 from gsmerge.prepare.place_cameras import add_views
+from gsmerge.prepare.prepare_scene import scored_pictures
 from gsmerge.raster import render_in_batches
 from gsmerge.raster.photos import NEAR_PLANE
 from gsmerge.reading.exporters import NO_HINTS, ReadHints
@@ -188,8 +189,11 @@ def prepare_panel(options: DrawOptions) -> Drawing:
         shown = None if photos is None else [photos[i] if i in pictured else None for i in ids]
         if shown and options.size:
             shown = [None if photo is None else fill_photo(photo, *options.size) for photo in shown]
-        marks = [info.antialiased for info in group.infos]
-        rows = view_pictures(named, cameras[ids], shown, names, marks=marks, background=options.background)
+        marks, masks = [info.antialiased for info in group.infos], None
+        if shown and not options.size:
+            counts = scored_pictures(scene)[0].masks  # of an object before one colour, the object counts
+            masks = None if counts is None else [counts[i] for i in ids]
+        rows = view_pictures(named, cameras[ids], shown, names, masks=masks, marks=marks, background=options.background)
         # If the scene has no cameras, gsmerge placed the views, the first half around the scene, the others inside it
         outer_cameras = cameras if group.load.cameras is not None else cameras[: len(cameras) // 2]
         outside = outside_pictures(

@@ -57,6 +57,7 @@ _PNG_CHUNKS = frozenset({b"IHDR", b"PLTE", b"tRNS", b"IDAT"})  # chunks that det
 Size = tuple[int, int]  # width and height in pixels
 Part = tuple[float, float, float, float]  # left, top, right and bottom of a part of a photo, as shares of its sides
 WHOLE: Part = (0.0, 0.0, 1.0, 1.0)  # all of a photo
+_DRAWN, _PNG_START = b"Software\0gsmerge render", 33  # mark of a drawing, and bytes of a PNG before its second chunk
 _AT_ONCE = 128 << 20  # most bytes of decoded photos in memory; if they need more, photos are decoded at each use
 
 
@@ -316,6 +317,20 @@ def _decode_brightness(path: Path, budget: ReadBudget) -> np.ndarray:
             if "A" in image.getbands():
                 rows[:] = np.round(rows * np.asarray(band.getchannel("A"), np.float32) / 255)
         return grey
+
+
+def mark_drawn(png: np.ndarray) -> np.ndarray:
+    """Mark the bytes of a ``.png`` as a drawing of gsmerge, so that a search for photos passes it by."""
+    chunk = b"tEXt" + _DRAWN
+    text = struct.pack(">I", len(_DRAWN)) + chunk + struct.pack(">I", zlib.crc32(chunk))
+    return np.concatenate([png[:_PNG_START], np.frombuffer(text, np.uint8), png[_PNG_START:]])
+
+
+def is_drawn(path: Path) -> bool:
+    """Return whether :func:`mark_drawn` marked a picture; False for a file that cannot be read."""
+    with suppress(OSError), path.open("rb") as file:
+        return _DRAWN in file.read(_PNG_START + 8 + len(_DRAWN))
+    return False
 
 
 def decode_alpha(path: Path) -> np.ndarray | None:

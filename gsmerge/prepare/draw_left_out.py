@@ -23,7 +23,7 @@ from gsmerge.types import PicturedScene
 # with a large empty part that no mask leaves out, as of an object, other holes are empty, too, and photos do not count
 # in the next RING widths
 HOLE, RIM, RING = 3, 2, 3
-SOFT = 1  # pixels at the edge between a uniform background and an object, where the photo mixes both
+SOFT = 1.5  # pixels at the edge of an object before a uniform background, where the photo mixes both
 NOISE = np.float32(16 / 255)  # largest difference between the colour of a uniform background and a pixel of it
 LEAST_ALIKE = 0.95  # least share of the pixels of a uniform background that differ less
 SOLID = 0.95  # opacity of a picture from which on it shows an object, and not Gaussians that reach over its edge
@@ -39,6 +39,7 @@ def mask_background(scene: PicturedScene) -> PicturedScene:
     fronts, counts = scene.get_pixels().fronts, counting_pixels(scene).copy()
     bare, num_views = (fronts < 0) | (scene.gaussians.opacities[fronts] <= BARE), 0
     unit, images = measure_unit(scene), [*scene.images]
+    importance = np.ones(counts.shape, np.float32) if scene.importance is None else scene.importance.copy()
     for view, photo in enumerate(scene.images):
         part = large_parts(bare[view]) & counts[view]
         if not part.any():
@@ -49,7 +50,10 @@ def mask_background(scene: PicturedScene) -> PicturedScene:
             alpha = render(scene.gaussians, scene.cameras[[view]]).alphas[0, ..., 0]
             _, labels = cv2.connectedComponents(is_alike.astype(np.uint8), connectivity=4)
             around = np.isin(labels, labels[part & is_alike]) & _grow(alpha < SOLID, RIM * unit)
-            counts[view] &= ~_grow(around | (is_alike & bare[view]), SOFT)
+            behind = around | (is_alike & bare[view])
+            mixed = _grow(behind, SOFT) & ~behind
+            counts[view] &= ~(behind | mixed)
+            importance[view][mixed & (alpha >= 1 - COVERED_TRANSMITTANCE)] = 0  # neither colour nor alpha is known
             # contrast with a bright background would hide what the object shows where photos are compared
             inner = photo[counts[view]].mean(0) if counts[view].any() else photo[part].mean(0)
             images[view] = np.where(counts[view][..., None], photo, inner)
@@ -57,7 +61,7 @@ def mask_background(scene: PicturedScene) -> PicturedScene:
     if not num_views:
         return scene
     note(f"{num_views} of {len(scene)} photos show one colour where the scene shows nothing; it counts as transparent")
-    return replace(scene, masks=counts, images=np.stack(images))
+    return replace(scene, masks=counts, images=np.stack(images), importance=importance)
 
 
 def draw_left_out(scene: PicturedScene, masks: np.ndarray | None) -> PicturedScene:
@@ -74,7 +78,7 @@ def draw_left_out(scene: PicturedScene, masks: np.ndarray | None) -> PicturedSce
     bare = transmittance > COVERED_TRANSMITTANCE
     if scene.beyond is not None:  # nothing is known there
         bare &= ~scene.beyond
-    solid = np.zeros_like(bare)
+    solid = np.zeros_like(bare) if scene.beyond is None else scene.beyond
     if scene.has_own_pixels:  # pictures already have the colours of the views' own Gaussians, which are solid
         colors, transmittance = scene.images.copy(), np.zeros_like(transmittance)
         solid = scene.get_pixels().shown & (scene.gaussians.opacities[scene.get_pixels().fronts] > BARE)

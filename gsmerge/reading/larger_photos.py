@@ -61,12 +61,12 @@ class PhotoSource:
 
 
 def find_larger_and_masks(
-    files: SceneFiles, source: PhotoSource, cameras: Cameras
+    files: SceneFiles, source: PhotoSource, cameras: Cameras, *, is_plain: bool = False
 ) -> tuple[LargePhotos | None, Masks, list[str]]:
     """Find the photos at the size of their files, if this size is larger than the scene's, and the masks of photos.
 
     A larger photo is read from its file when it is used. Photos inside other files stay in memory. Masks come from
-    files and from the photos' transparency.
+    files and, unless ``is_plain``, from the photos' transparency.
 
     ``files`` are those of the scene, and ``cameras`` the scene's cameras. Returns the larger photos (None if there are
     none), the masks, and notes.
@@ -107,7 +107,7 @@ def find_larger_and_masks(
         to_file[:2, 2] = corner / scale - start
         Ks_of_file = matmul(to_file, cameras.Ks)
         large = LargePhotos(Ks_of_file, right - left, bottom - top, tuple(range(len(cameras))), read)
-    return large, *read_masks(files, camera_file, photos, stored, cut, cameras)
+    return large, *read_masks(files, camera_file, photos, stored, cut, cameras, is_plain)
 
 
 def limit_photo_size(

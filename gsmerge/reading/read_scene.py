@@ -414,8 +414,9 @@ def _add_larger_and_masks(load: Loaded) -> Loaded:
     if mask_options and not source.size:
         text = f"the pictures of --{' and --'.join(mask_options)} are not used, since there are no photos"
         notes.append(Doubt(text) if files.named.intersection(mask_options) else text)
+    is_plain = "masks" in files.named and files.masks is None  # the user wants no masks
     try:
-        large, masks, mask_notes = find_larger_and_masks(files, source, scene.cameras)
+        large, masks, mask_notes = find_larger_and_masks(files, source, scene.cameras, is_plain=is_plain)
     except SceneError as error:
         is_protecting = files.protect is not None and Path(error.path).is_relative_to(files.protect)
         is_listed = isinstance(error, CameraMaskError) or Path(error.path) in source.photos.paths

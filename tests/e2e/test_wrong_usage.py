@@ -102,7 +102,7 @@ USAGE = {
     "extend state.gsm room --fit full": "*--fit*fit=VALUE",
     "extend room/scene.ply room": "room/scene.ply*.gsm",
     "extend occupied room": "occupied*.gsm",
-    "extend state.gsm room room --cameras a --images b": "--cameras and --images*several",
+    "extend state.gsm room room --cameras a --images b": "--cameras, --images and --masks*several",
     "render room -o sheet.png --set superpixels=100": "*--set",
     "render room -o occupied": "occupied*empty*--overwrite",
     "render room -o sheet.xyz": "sheet.xyz*.png*folder",

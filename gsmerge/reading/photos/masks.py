@@ -67,12 +67,13 @@ class MaskFiles:
     cut: Callable[[int, np.ndarray], np.ndarray]  # view, picture of the size ``stored`` -> what the view shows of it
     cameras: Cameras
     stored_counts: np.ndarray | None = None  # [v,h,w] bool, where photos inside another file count; None: everywhere
+    is_plain: bool = False  # whether transparency leaves nothing out
 
     def read(self, view: int) -> tuple[np.ndarray | None, np.ndarray | None]:
         """Read which pixels ``[h,w]`` of a view count, and their weights ``[h,w]``; None: all count, with weight 1."""
         photo, counts = self.photos[view] if self.photos else None, None
         importance: np.ndarray | None = None
-        alpha = None if photo is None else decode_alpha(photo)
+        alpha = None if photo is None or self.is_plain else decode_alpha(photo)
         alpha = alpha if self.stored_counts is None else self.stored_counts[view]
         min_level = 191  # level of 255; a pixel counts if three quarters of the file's pixels in it count
         if photo is not None and self.canvas not in (None, image_size(photo)):
@@ -131,8 +132,9 @@ def read_masks(
     stored: Size,
     cut: Callable[[int, np.ndarray], np.ndarray],
     cameras: Cameras,
+    is_plain: bool,
 ) -> tuple[Masks, list[str]]:
-    """Read the masks of a scene's photos; return them and notes.
+    """Read the masks of a scene's photos; return them and notes. If ``is_plain``, transparency leaves nothing out.
 
     The masks that the camera file lists are used, or if it lists none, masks beside the scene. ``stored`` and ``cut``
     are fields of :class:`MaskFiles`. SceneError if masks are photos, or outside the folder of the cameras that name
@@ -167,8 +169,10 @@ def read_masks(
 
     masks, protecting = list_by_view(photo_masks), list_by_view(photo_protecting)
     turns = photos.turns or (0,) * len(masks)
-    part, canvas, stored_counts = photos.fit.part, photos.canvas, None if paths else camera_file.counts
-    mask_files = MaskFiles(tuple(paths), turns, masks, protecting, part, canvas, stored, cut, cameras, stored_counts)
+    part, canvas, stored_counts = photos.fit.part, photos.canvas, None if paths or is_plain else camera_file.counts
+    mask_files = MaskFiles(
+        tuple(paths), turns, masks, protecting, part, canvas, stored, cut, cameras, stored_counts, is_plain
+    )
     counts, importance = zip(*parallel_map(mask_files.read, range(len(masks))), strict=True)
     error, place = (CameraMaskError, camera_file.path) if by_cameras else (SceneError, files.masks or "")
     _refuse_photos(error, place, "masks", masks, photos.pictures)
@@ -273,16 +277,19 @@ def check_masks(masks: Masks, files: SceneFiles, scene: Scene) -> tuple[Masks, l
         if is_named:
             raise SceneError(where, problem, "invert them, or name another folder with --masks")
         return NO_MASKS, [Doubt(f"masks are not used: {where}: {problem}; name them with --masks")]
-    if not is_named and 2 * _share_of_gaussians(scene, counts) < 1:
-        problem = f"they leave out {100 * share:.0f} % of the photos' pixels, and most of what the Gaussians show"
+    hides_most = 2 * _share_of_gaussians(scene, counts) < 1
+    problem = f"they leave out {100 * share:.0f} % of the photos' pixels, and most of what the Gaussians show"
+    if hides_most and is_named:
+        return masks, [f"masks {where}: {problem}; if they are bright where photos do not count, invert them"]
+    if hides_most:
         remedy = (
             f"if they are right, name them with --masks, transparency saved as grey pictures; or pass --masks {NONE}"
         )
         return NO_MASKS, [Doubt(f"masks are not used: {where}: {problem}; {remedy}")]
     count = int((~counts.all((1, 2))).sum())
-    return masks, [
-        f"masks leave out {100 * share:.0f} % of the photos' pixels; {count} of {len(counts)} photos have a mask"
-    ]
+    kind = "transparency or masks" if files.masks is None else "masks"
+    left_out = f"{kind} leave out {100 * share:.0f} % of the photos' pixels"
+    return masks, [f"{left_out}; {count} of {len(counts)} photos have a mask"]
 
 
 def _share_of_gaussians(scene: Scene, counts: np.ndarray) -> float:

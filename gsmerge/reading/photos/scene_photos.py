@@ -33,6 +33,7 @@ from gsmerge.io.photo_files import (
     decode_small,
     extend_picture,
     image_size,
+    is_drawn,
     orientation_turn,
     part_size,
     same_shape,
@@ -211,8 +212,9 @@ def find_named_photos(
     cameras, with endings; a place below the first root, which is near the cameras; photos with colours, unlike masks
     and depths; photos of the size of the cameras, or of their shape; photos with more pixels.
 
-    Returns the folder, the photos of this folder and of the next best folders, and the photo of each camera, or None
-    for a camera without a photo. Returns None if no folder has photos by name.
+    Folders of pictures that gsmerge drew are passed by. Returns the folder, the photos of this folder and of the next
+    best folders, and the photo of each camera, or None for a camera without a photo. Returns None if no folder has
+    photos by name.
     """
     pools = dict[Path, dict[Path, None]]()  # folder -> photos in it and below
     for root in roots:
@@ -228,7 +230,7 @@ def find_named_photos(
         """Return a key that sorts better folders first: minus the number of cameras with a photo, then the criteria."""
         proposed = propose_images(folder, list(pools[folder]), camera_file.names, count_pixels)
         first = next(filter(count_pixels, filter(None, proposed)), None)
-        if first is None:
+        if first is None or is_drawn(first):
             return 0, folder
         camera_size, size = sizes[proposed.index(first)], image_size(first)
         has_other_shape = min(camera_size) > 1 and not same_shape(camera_size, size)

@@ -52,6 +52,17 @@ def test_a_view_without_a_photo_is_drawn_without_a_score() -> None:
     assert second[1][0].endswith("dB to the photo")
 
 
+def test_scores_of_a_panel_are_those_where_photos_count() -> None:
+    photo, mask = np.full((12, 20, 3), 0.2, np.float32), np.zeros((12, 20), bool)
+    mask[4:8, 8:12] = True
+    texts = [
+        preview.view_pictures([("one", blob(0.3))], cameras(1), [where], masks=[mask])[0][1][0]
+        for where in (photo, np.where(mask[..., None], photo, np.float32(1)))
+    ]
+    assert texts[0] == texts[1]
+    assert texts[0].endswith("dB to the photo, where it counts")
+
+
 def test_labels_of_equal_pictures_say_no_difference() -> None:
     ((_, (text, _)),) = preview.view_pictures([("one", blob(0.3)), ("two", blob(0.3))], cameras(1))
     assert text == "two: 1, no difference to one"

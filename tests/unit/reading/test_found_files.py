@@ -14,6 +14,7 @@ from exports import export_rows, save_export, smooth_scene
 from messages import names, noted
 from tiny_scene import Tiny, rotation, write_colmap_binary, write_colmap_text, write_images, write_transforms
 
+from gsmerge.drawing.preview import save_picture
 from gsmerge.io import write_ply
 from gsmerge.jobs.inspect import inspect
 from gsmerge.reading.read_scene import Loaded, load_scene
@@ -215,3 +216,13 @@ def test_masks_that_leave_out_all_are_not_used(tmp_path: Path) -> None:
     assert loaded.scene.masks is None
     (note,) = (text for text in loaded.notes if "masks" in text)
     assert names(note, "bright", "--masks")
+
+
+def test_pictures_that_gsmerge_drew_are_no_photos(tmp_path: Path) -> None:
+    """Renders have the names of the cameras, whose photos they are not."""
+    save_export(tmp_path, SMOOTH, export_rows(SMOOTH, ROWS["voxels"]), cameras=False)
+    write_colmap_text(tmp_path / "sparse/0", flat())
+    for name, image in zip(flat().names, SMOOTH.images, strict=True):
+        save_picture(tmp_path / "drawn" / name, image)
+    assert load_scene(tmp_path).scene.images is None
+    assert load_scene(tmp_path, images=tmp_path / "drawn").scene.images is not None

@@ -313,3 +313,11 @@ def test_photos_in_place_of_masks_are_refused(tmp_path: Path, kind: str, ending:
     (folder / "transforms.json").write_text(json.dumps(document))
     with refuses(SceneError, "transforms.json", "3 of 3", "--masks none"):
         load_scene(folder)
+
+
+def test_no_masks_wanted_means_no_transparency(tiny_folder: Path, tiny: Tiny) -> None:
+    """--masks none, so that a photo whose alpha is something else counts whole."""
+    for name, image in zip(tiny.names, tiny.images, strict=True):
+        write(tiny_folder / "images" / name, np.dstack([image, half(tiny).astype(np.uint8) * 255]))
+    assert load_scene(tiny_folder).scene.masks is not None
+    assert load_scene(tiny_folder, masks="none").scene.masks is None
