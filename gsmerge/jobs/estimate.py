@@ -58,7 +58,7 @@ COST_NETWORKS = 1.4  # the shipped networks
 COST_PAPER = 4.5  # the paper's networks, which have more inputs and refine
 COST_PAIRS = 3.0  # merging neighbours pair by pair
 COST_PLACED = 6.0  # drawing a scene without views from placed views
-COST_SLOW = {"greedy": 25.0, "splat-transform": 60.0}  # in addition, for slow methods
+COST_SLOW = {"slic": 4.5, "greedy": 25.0, "splat-transform": 60.0}  # in addition, for slow methods
 # Seconds for each step of the fit:
 COST_STEP = 0.1  # per million pixels of its view
 COST_DRAWN = 0.25  # per million Gaussians that it draws

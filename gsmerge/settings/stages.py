@@ -17,7 +17,7 @@ Extent = Literal["auto", "photos", "beyond"]
 MatchMethod = Literal["overlap", "aabb", "none"]
 KRule = Literal["saliency", "distortion"]
 
-SEGMENTATIONS = ("rdseg", "bass", "bass-st", "grid")
+SEGMENTATIONS = ("rdseg", "bass", "bass-st", "slic", "grid")
 SHARE = "4.4%"  # default number of superpixels per pixel
 MAX_CHILDREN = 8  # most Gaussians that a superpixel may become
 MIXED, MIXED_COUNTS = "mixed", (1, 2, 4)  # with this option, K is one of these numbers for each group

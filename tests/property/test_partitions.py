@@ -18,6 +18,7 @@ SEGMENTATIONS = [
     ("rdseg", {"rectangles": 3.0, "early_sweeps": 1}),
     ("bass", {}),
     ("bass-st", {}),
+    ("slic", {}),
 ]
 
 

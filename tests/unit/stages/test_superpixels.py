@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from typing import Any
 
 import numpy as np
@@ -127,3 +128,9 @@ def test_flat_pictures_get_even_seeds(value: float) -> None:
     seeds = seeds_from_density(density, 240)
     quarters = np.histogram2d(seeds[:, 0], seeds[:, 1], bins=2, range=[[0, 40], [0, 60]])[0]
     assert quarters == pytest.approx(np.full((2, 2), 60), abs=6)
+
+
+def test_slic_without_its_package_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "skimage.segmentation", None)
+    with pytest.raises(ValueError, match="pip install scikit-image"):
+        superpixels(np.zeros((8, 8, 3), np.float32), 4, "slic")
