@@ -36,14 +36,15 @@ def mask_background(scene: PicturedScene) -> PicturedScene:
     """
     if scene.region is not None:
         return scene
-    fronts, counts = scene.get_pixels().fronts, counting_pixels(scene).copy()
+    fronts, counts = scene.get_pixels().fronts, counting_pixels(scene)
     bare, num_views = (fronts < 0) | (scene.gaussians.opacities[fronts] <= BARE), 0
-    unit, images = measure_unit(scene), [*scene.images]
+    parts = {view: part for view in range(len(scene)) if (part := large_parts(bare[view]) & counts[view]).any()}
+    if not parts:
+        return scene
+    unit, counts, images = measure_unit(scene), counts.copy(), [*scene.images]
     importance = np.ones(counts.shape, np.float32) if scene.importance is None else scene.importance.copy()
-    for view, photo in enumerate(scene.images):
-        part = large_parts(bare[view]) & counts[view]
-        if not part.any():
-            continue
+    for view, part in parts.items():
+        photo = images[view]
         is_alike = np.abs(photo - np.median(photo[part], 0)).max(-1) <= NOISE
         if is_alike[part].mean() >= LEAST_ALIKE:
             # an object of the background's colour is solid; large Gaussians reach over its edge, and are not
@@ -101,8 +102,10 @@ def measure_unit(scene: PicturedScene) -> float:
 
     Views may have far more pixels than a model made Gaussians from.
     """
+    if scene.has_own_pixels:
+        return 1.0
     fronts = [front[front >= 0] for front in scene.get_pixels().fronts]
-    widths = [np.sqrt(front.size / np.unique(front).size) for front in fronts if front.size]
+    widths = [np.sqrt(front.size / np.count_nonzero(np.bincount(front))) for front in fronts if front.size]
     return max(1.0, float(np.median(widths))) if widths else 1.0
 
 
