@@ -63,6 +63,18 @@ def exporter_frames(cameras: Cameras, scale: float | None = None) -> list[Simila
     ]
 
 
+def quarter_turns() -> list[Similarity]:
+    """List the turns of the world by 90, 180 and 270 degrees about each axis, as from y up to z up."""
+    turns = list[Similarity]()
+    for axis, name in enumerate("xyz"):
+        first, second = (axis + 1) % 3, (axis + 2) % 3
+        for degrees, cosine, sine in ((90, 0, 1), (180, -1, 0), (270, 0, -1)):
+            rotation = np.eye(3)
+            rotation[[first, second, first, second], [first, second, second, first]] = cosine, cosine, -sine, sine
+            turns.append(Similarity(rotation, 1.0, np.zeros(3), f"turned by {degrees} degrees about the {name} axis"))
+    return turns
+
+
 def fit_frame(cameras: Cameras, poses: np.ndarray, scale: float | None) -> Similarity:
     """Fit the similarity that moves cameras to ``poses [c,4,4]``, with a description in words.
 

@@ -14,7 +14,7 @@ from gsmerge.io.cameras.camera_file import Convention
 from gsmerge.kernels.elementary import exp
 from gsmerge.kernels.matrices import invert, matmul
 from gsmerge.reading.alignment.conventions import PosesInConvention, other_conventions
-from gsmerge.reading.alignment.frames import exporter_frames
+from gsmerge.reading.alignment.frames import exporter_frames, quarter_turns
 from gsmerge.reading.alignment.grids import Grid, with_poses
 from gsmerge.reading.alignment.score import AlignmentInput, photo_colors
 from gsmerge.types import Cameras, Gaussians
@@ -238,14 +238,15 @@ def _check_colors(inputs: AlignmentInput, cameras: Cameras, name: str, no_pixels
 def _choose_frame(inputs: AlignmentInput, usual: CameraCheck) -> Similarity | None:
     """Choose a frame in which the colours fit the photos clearly better than in the frame of the cameras.
 
-    Returns None if no frame fits clearly better. The frames of exporters are tried. ``usual`` is the check of the
-    cameras as they are. Colours fit best at the true scale, so the chosen frame must fit better than the same frame at
-    nearby scales. If no frame stands out at the scale of the cameras, the scale is solved for.
+    Returns None if no frame fits clearly better. The frames of exporters are tried and, if the cameras as they are do
+    not fit, the world turned about its axes. ``usual`` is the check of the cameras as they are. Colours fit best at the
+    true scale, so the chosen frame must fit better than the same frame at nearby scales. If no frame stands out at the
+    scale of the cameras, the scale is solved for.
     """
     if not len(inputs.images):
         return None
     frames = exporter_frames(inputs.cameras)
-    best, score = _best_frame(inputs, frames)
+    best, score = _best_frame(inputs, frames if usual.ok else [*frames, *quarter_turns()])
     stands_out = _stands_out(inputs, best, score)
     # views without a photo are black and do not count; one photo is too few, because it fits somewhere in any scene
     if inputs.scale is None and not stands_out and inputs.images.any((1, 2, 3)).sum() > 1:

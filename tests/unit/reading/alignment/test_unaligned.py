@@ -55,6 +55,20 @@ def test_cameras_are_rotated_into_the_first_for_padded_rows_of_volsplat(tmp_path
     assert np.allclose(viewmats[:, :3, 3], SMOOTH.w2c[:, :3, 3], atol=1e-6)
 
 
+@pytest.mark.parametrize(("axis", "degrees"), [(0, 90), (0, 270), (1, 90), (2, 180)])
+def test_cameras_are_turned_about_an_axis_for_voxels_with_another_axis_up(
+    tmp_path: Path, axis: int, degrees: int
+) -> None:
+    """As Blender has z up; the photos' colours decide."""
+    vector = np.zeros(3)
+    vector[axis] = np.radians(degrees)
+    turn = np.round(cv2.Rodrigues(vector)[0])
+    loaded = load_scene(save_export(tmp_path, SMOOTH, turned(voxel_rows(), turn)))
+    expected = f"the cameras are turned by {degrees} degrees about the {'xyz'[axis]} axis, as the photos' colours show"
+    assert expected in loaded.notes
+    assert np.allclose(loaded.scene.cameras.viewmats[:, :3, :3], SMOOTH.w2c[:, :3, :3] @ turn.T, atol=1e-6)
+
+
 @sweep("scale", [0.2, 1.0, 3.0])
 def test_cameras_are_moved_into_the_first_for_voxels_at_any_scale(tmp_path: Path, scale: float) -> None:
     first = SMOOTH.w2c[0]
