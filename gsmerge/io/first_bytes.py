@@ -38,7 +38,7 @@ _TRAIN_OR_MAKE = "train Gaussians on it, or make Gaussians from the photos with 
 _WRITE_GAUSSIANS = (
     "write its Gaussians as .ply, with ns-export gaussian-splat (nerfstudio) or the option save_ply (gsplat)"
 )
-_EXPORT = "export the scene from that program as .ply"
+_EXPORT = "export the scene from its program as .ply"
 FILM = "a film"
 # The npm package of a program that converts other formats
 CONVERTER_PACKAGE = "@playcanvas/splat-transform@3.7"
@@ -55,6 +55,8 @@ FOREIGN: dict[str, tuple[str, str]] = {
     **dict.fromkeys((".ksplat", ".lcc", ".lcc2"), _PACKED_BY_OTHERS),
     **dict.fromkeys((".las", ".laz", ".e57", ".pcd", ".xyz", ".pts", ".ptx"), ("a cloud of points", _TRAIN_OR_MAKE)),
     **dict.fromkeys((".obj", ".fbx", ".stl", ".dae", ".off", ".blend", ".abc"), ("a mesh", _TRAIN_OR_MAKE)),
+    **dict.fromkeys((".usd", ".usdz", ".usda", ".usdc"), ("a scene of USD", _EXPORT)),
+    ".bgeo": ("a geometry of Houdini", _EXPORT),
     ".ssproj": ("a project of SuperSplat", _EXPORT),
     ".psht": ("a project of Postshot", _EXPORT),
     ".rad": ("levels of Spark", "name the .ply or .spz that they were made from"),

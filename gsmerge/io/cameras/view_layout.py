@@ -6,6 +6,7 @@ format.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
@@ -333,6 +334,8 @@ def _focal(values: Mapping[str, float], axis: str, side: float) -> float:
         return values[f"f{axis}"]
     if f"angle_{axis}" in values:
         half = 0.5 * values[f"angle_{axis}"]
+        if half >= math.pi / 2:
+            raise ValueError(f"an angle of view of {2 * half:g} radians, half a turn or more; is it in degrees?")
         with np.errstate(all="ignore"):  # an angle of 0 gives an infinite focal length, which is refused later
             return float(0.5 * side * cos(half) / sin(half))
     return 0.0

@@ -209,6 +209,7 @@ def choose_cameras(
         return replace(grid, frame=frame, shown_by="photos' colours"), []
     if not check.ok:
         remedy = f"{no_pixels.remedy}, or write their shift (x y z) to offset.txt beside the file"
+        remedy += ", or copy nerfstudio's dataparser_transforms.json there"
         if check.share_seen > 0.5:  # the views see most Gaussians, so only the colours contradict the cameras
             remedy += "; if the cameras are right, the photos or the colours of the file are wrong: --images none keeps"
             remedy += " the cameras, and --hint colors=rgb reads f_dc as RGB"

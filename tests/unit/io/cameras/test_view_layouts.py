@@ -166,6 +166,14 @@ def test_a_missing_size_is_that_of_the_images(tmp_path: Path) -> None:
     np.testing.assert_allclose(actual.Ks[0], diagonal(20, 20, 10, 7))
 
 
+def test_an_angle_of_view_in_degrees_is_refused(tmp_path: Path) -> None:
+    path = FORMATS["transforms.json"].write(tmp_path)
+    with edited_json(path) as data:
+        in_file(*BARE, camera_angle_x=46.2)(data)
+    with refuses(SceneError, "transforms.json", "46.2", "in degrees"):
+        read_cameras(path)
+
+
 def test_a_size_that_nothing_needs_may_be_missing(tmp_path: Path) -> None:
     path = FORMATS["transforms.json"].write(tmp_path)
     with edited_json(path) as data:
