@@ -1,5 +1,7 @@
 """Train the networks by comparing renders with photos."""
 
+from gsmerge.research.training.backbones import Backbone as Backbone
+from gsmerge.research.training.backbones import Capture as Capture
 from gsmerge.research.training.examples import Example as Example
 from gsmerge.research.training.examples import make_example as make_example
 from gsmerge.research.training.loop import train as train

@@ -28,7 +28,8 @@ from gsmerge.geometry.views import even_views
 from gsmerge.io.atomic import atomic_output
 from gsmerge.networks.checkpoint import save_checkpoint
 from gsmerge.networks.corrections import LOGIT_COLUMN
-from gsmerge.research.training.examples import Example, draw_random_views, recolor
+from gsmerge.research.training.backbones import Capture, draw_example
+from gsmerge.research.training.examples import Example, recolor
 from gsmerge.research.training.losses import render_window, window_loss, window_psnr
 from gsmerge.research.training.modules import Head, Networks
 from gsmerge.research.training.shards import Shard, read_shard
@@ -43,7 +44,7 @@ RUN_FORMAT = "gsmerge-training"
 RUN_REMEDY = "choose another --output, or remove it to start again"
 
 
-def validate(networks: Networks, shards: Sequence[Shard], options: TrainOptions) -> LossRow:
+def validate(networks: Networks, shards: Sequence[Shard | Capture], options: TrainOptions) -> LossRow:
     """Measure the mean PSNR (dB) of windows without and with networks, and the share of merged Feature Gaussians."""
 
     def score_window(window: Window) -> tuple[float, float, float]:
@@ -55,9 +56,9 @@ def validate(networks: Networks, shards: Sequence[Shard], options: TrainOptions)
     scores = list[tuple[float, float, float]]()
     for number, shard in enumerate(shards):
         rng = np.random.default_rng([options.seed, VALIDATION, number])  # a shard gets the same windows every time
-        example, windows = read_shard(shard), list[Window]()
+        read, windows = lru_cache(1)(read_shard), list[Window]()
         for _ in range(options.validation_windows):
-            part = draw_random_views(example, options, rng)
+            part = draw_example(shard, options, rng, read)
             windows.append(sample_window(part, options.levels, options.window, options.most, novel=1, rng=rng))
         scores += parallel_map(score_window, windows)
     analytic, learned, matched = np.mean(scores, 0).tolist()
@@ -93,8 +94,8 @@ class TrainResult:
 
 
 def train(
-    shards: Sequence[Shard],
-    validation: Sequence[Shard],
+    shards: Sequence[Shard | Capture],
+    validation: Sequence[Shard | Capture],
     out: Path,
     options: TrainOptions | None = None,
     *,
@@ -104,7 +105,7 @@ def train(
     """Train networks, or continue the run in the folder.
 
     Args:
-        shards: At least one example.
+        shards: At least one example: stored ones, or captures whose Gaussians a frozen backbone predicts.
         validation: Examples by which the best checkpoint is chosen; empty: other windows of ``shards``.
         out: Folder for ``best.safetensors``, ``last.safetensors``, ``losses.csv`` and ``state.safetensors``.
         options: Settings.
@@ -121,7 +122,7 @@ def train(
         raise ValueError("examples: expected at least one, got none")
     options.require_weights()
     out.mkdir(parents=True, exist_ok=True)
-    validators: Sequence[Shard] = validation or shards
+    validators: Sequence[Shard | Capture] = validation or shards
     ids = even_views(len(validators), min(len(validators), options.validation_examples))
     validators = [validators[i] for i in ids]
     hashes = {kind: [shard.sha256 for shard in part] for kind, part in (("data", shards), ("validation", validators))}
@@ -188,7 +189,11 @@ def _save_run(
 
 
 def _take_step(
-    state: TrainingState, shards: Sequence[Shard], read: Callable[[Shard], Example], options: TrainOptions, step: int
+    state: TrainingState,
+    shards: Sequence[Shard | Capture],
+    read: Callable[[Shard], Example],
+    options: TrainOptions,
+    step: int,
 ) -> Tensor:
     """Take one step on the mean gradient of all crops, each of a random example; return the mean loss."""
     parameters = list(state.networks.parameters())
@@ -196,7 +201,7 @@ def _take_step(
     def crop_gradients(crop: int) -> Tensor:
         """Compute the gradients of one crop as one vector, whose last element is the loss."""
         rng = np.random.default_rng([options.seed, step, crop])
-        example = draw_random_views(read(shards[int(rng.integers(len(shards)))]), options, rng)
+        example = draw_example(shards[int(rng.integers(len(shards)))], options, rng, read)
         if options.recolor:
             example = recolor(example, rng)
         window = sample_window(example, options.levels, options.window, options.most, options.novel, rng)
