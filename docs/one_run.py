@@ -428,7 +428,7 @@ def result_section(run: Run) -> str:
             entry("result.gaussians.opacities", gaussians.opacities, child),
             entry("report.psnr_before", f"{report.psnr_before:.2f}"),
             entry("report.psnr_after", f"{report.psnr_after:.2f}"),
-            entry("report.new_views", f"{new.low:+.1f} to {new.high:+.1f} dB"),
+            entry("report.new_views", f"about {new.gain:+.1f} dB"),
         ]),
         text(
             f"{len(gaussians):,} Gaussians replace {run.prepared.input_scene.num_gaussians:,}.",

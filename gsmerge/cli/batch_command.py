@@ -207,7 +207,7 @@ class Totals:
             # without photos the result is compared with the input
             quality = ["the input", "equal" if fidelity["psnr"] >= MAX_PSNR else f"{fidelity['psnr']:.2f}"]
         counts, new = [f"{report[name]['num_gaussians']:,}" for name in ("output", "input")], report["new_views"]
-        gain = "" if new is None else f"{new['low']:+.1f} to {new['high']:+.1f} dB"
+        gain = "" if new is None else f"about {new['after'] - new['before']:+.1f} dB"
         share, seconds = human_share(report["ratio"]), f"{report['total_seconds']:.1f}"
         self.rows.append((record["output"], *counts, share, gain, *quality, seconds))
 

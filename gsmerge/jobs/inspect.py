@@ -254,7 +254,7 @@ def inspection_lines(scene: Mapping[str, Any]) -> list[str]:
         shares = (f"{100 * agreement[key]:.0f} %" for key in ("confirmed", "contradicted", "alone"))
         lines += ["depth      other views confirm {} of the pixels, contradict {}, do not see {}".format(*shares)]
     if new := scene["new_views"]:
-        gain = f"{new['low']:+.1f} to {new['high']:+.1f} dB expected against its input"
+        gain = f"about {new['after'] - new['before']:+.1f} dB against its input"
         lines += [f"new views  {gain}, which shows them at {new['before']:.1f} dB"]
     run = scene["compact"]
     lines += ["compact    would refuse the scene as it is"] if run is None else estimate_lines(run)
