@@ -225,17 +225,11 @@ def _fill_view(scene: PicturedScene, view: int, holes: np.ndarray, edges: _Edges
         total, number = blur(sums, DIFFERENCE_BLUR).reshape(-1, 2)[pixels].T
         cost = np.where(number > min_weight, total / np.maximum(number, min_weight), np.inf) + min_gain * step
         best_depths, best_costs = np.where(cost < best_costs, depth, best_depths), np.minimum(cost, best_costs)
+    if edges.known is not None:
+        farthest = edges.farthest * FACTORS[-1]
+        best_depths = np.where(np.isfinite(edges.known), np.minimum(edges.known, farthest), best_depths)
     size = NEW_SIZE_PIXELS / cameras.Ks[view, 0, 0]
-    if edges.known is None:
-        return make_round_gaussians(eye, rays, best_depths, size, colors, scene.gaussians.shN.shape[1])
-    farthest, fronts = edges.farthest * FACTORS[-1], scene.get_pixels().fronts[view]
-    best_depths = np.where(np.isfinite(edges.known), np.minimum(edges.known, farthest), best_depths)
-    added = make_round_gaussians(eye, rays, best_depths, size, colors, scene.gaussians.shN.shape[1])
-    # the model would have made a Gaussian as beside the hole
-    like = scene.gaussians[fill_gaps(fronts[..., None], fronts >= 0)[..., 0][holes]]
-    scale = best_depths / camera_depths(like.means.astype(np.float64), cameras.viewmats[view])
-    scales = (scale[:, None] * like.scales).astype(np.float32)
-    return replace(added, quats=like.quats, scales=scales, opacities=like.opacities)
+    return make_round_gaussians(eye, rays, best_depths, size, colors, scene.gaussians.shN.shape[1])
 
 
 def pixel_rays(mask: np.ndarray, K: np.ndarray, viewmat: np.ndarray) -> np.ndarray:
