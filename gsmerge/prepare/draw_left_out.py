@@ -11,7 +11,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from gsmerge.prepare.fill_holes import BARE, large_parts
+from gsmerge.prepare.fill_holes import find_bare, large_parts
 from gsmerge.prepare.photo_change import PhotoChange, change_large
 from gsmerge.raster import render
 from gsmerge.raster.photos import COVERED_TRANSMITTANCE, counting_pixels
@@ -36,8 +36,7 @@ def mask_background(scene: PicturedScene) -> PicturedScene:
     """
     if scene.region is not None:
         return scene
-    fronts, counts = scene.get_pixels().fronts, counting_pixels(scene)
-    bare, num_views = (fronts < 0) | (scene.gaussians.opacities[fronts] <= BARE), 0
+    bare, counts, num_views = find_bare(scene), counting_pixels(scene), 0
     parts = {view: part for view in range(len(scene)) if (part := large_parts(bare[view]) & counts[view]).any()}
     if not parts:
         return scene
@@ -82,7 +81,7 @@ def draw_left_out(scene: PicturedScene, masks: np.ndarray | None) -> PicturedSce
     solid = np.zeros_like(bare) if scene.beyond is None else scene.beyond
     if scene.has_own_pixels:  # pictures already have the colours of the views' own Gaussians, which are solid
         colors, transmittance = scene.images.copy(), np.zeros_like(transmittance)
-        solid = scene.get_pixels().shown & (scene.gaussians.opacities[scene.get_pixels().fronts] > BARE)
+        solid = ~find_bare(scene)
     for view, hole in enumerate(holes):
         left_out = np.zeros(hole.shape, bool) if masks is None else ~masks[view]
         nothing = _grow(~_grow(~bare[view], HOLE * unit), HOLE * unit)

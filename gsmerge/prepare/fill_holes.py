@@ -58,7 +58,7 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = Fa
     """
     fronts, is_cropped, beyond = scene.get_pixels().fronts, scene.region is not None, scene.beyond
     fillable = shown & (fronts < 0)  # pixels with a picture and without a Gaussian
-    bare = (fronts < 0) | (scene.gaussians.opacities[fronts] <= BARE)  # pixels that seem to show nothing
+    bare = find_bare(scene)
     views = [
         view
         for view in range(len(scene))
@@ -103,6 +103,12 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = Fa
             )
         scene = fill_pixels(scene, added, pixels)
     return _leave_empty(scene, empty)
+
+
+def find_bare(scene: PicturedScene) -> np.ndarray:
+    """Return a mask ``[v,h,w]`` of pixels that seem to show nothing: no Gaussian is in front, or a faint one."""
+    fronts = scene.get_pixels().fronts
+    return np.asarray((fronts < 0) | (scene.gaussians.opacities[fronts] <= BARE))
 
 
 def _find_empty(opacity: np.ndarray, shown: np.ndarray, gap: int, *, is_cropped: bool) -> np.ndarray:

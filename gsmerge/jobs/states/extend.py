@@ -146,8 +146,9 @@ def _keep_pictures(prepared: Prepared) -> Scene:
     # A view may have several layers of Gaussians, each with the same camera, and only the first layer is kept
     first_layers = np.unique(camera_kinds(input_scene.cameras), return_index=True)[1]
     views = sorted(first_layers.tolist())
-    images = prepared.scene.images[[prepared.repeated[view] for view in views]]
-    masks = None if prepared.scene.masks is None else prepared.scene.masks[[prepared.repeated[view] for view in views]]
+    kept = [prepared.repeated[view] for view in views]
+    images, masks = prepared.scene.images[kept], prepared.scene.masks
+    masks = None if masks is None else masks[kept]
     cameras = in_float64(input_scene.cameras[views])
     return Scene(no_gaussians, cameras, images, None, tuple(input_scene.names[view] for view in views), masks=masks)
 

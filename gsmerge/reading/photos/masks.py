@@ -73,8 +73,9 @@ class MaskFiles:
         """Read which pixels ``[h,w]`` of a view count, and their weights ``[h,w]``; None: all count, with weight 1."""
         photo, counts = self.photos[view] if self.photos else None, None
         importance: np.ndarray | None = None
-        alpha = None if photo is None or self.is_plain else decode_alpha(photo)
-        alpha = alpha if self.stored_counts is None else self.stored_counts[view]
+        alpha = None if self.stored_counts is None else self.stored_counts[view]  # only of photos without files
+        if photo is not None and not self.is_plain:
+            alpha = decode_alpha(photo)
         min_level = 191  # level of 255; a pixel counts if three quarters of the file's pixels in it count
         if photo is not None and self.canvas not in (None, image_size(photo)):
             whole = np.full(image_size(photo)[::-1], True)

@@ -13,7 +13,7 @@ from gsmerge.raster import make_splats, tile_view
 from gsmerge.raster.composite import list_contributions
 from gsmerge.raster.photos import Photos, blank_photos
 from gsmerge.raster.tiled_view import Splats
-from gsmerge.reading.alignment.registration.join import concat_scenes
+from gsmerge.reading.alignment.registration.join import concat_scenes, concat_values
 from gsmerge.runtime.memory import free_pages, make_array
 from gsmerge.runtime.record import add_seconds, begin_part, record_choices, record_part, stage
 from gsmerge.runtime.threads import in_turn
@@ -103,11 +103,9 @@ def join_views(scene_views: Sequence[tuple[PicturedScene, list[int]]]) -> Pictur
         free_pages([scene.images, images])
     joined = concat_scenes([subset(scene.without_pictures(), ids) for scene, ids in scene_views], images)
     pictured = PicturedScene.with_pictures(replace(joined, cameras=in_float64(joined.cameras)), images, joined.masks)
-    if all(scene.empty is None for scene, _ in scene_views):
-        return pictured
-    no_pixel = np.zeros(images.shape[1:3], np.float32)
-    empty = [no_pixel if scene.empty is None else scene.empty[view] for scene, ids in scene_views for view in ids]
-    return replace(pictured, empty=np.stack(empty))
+    shares = [None if scene.empty is None else scene.empty[ids] for scene, ids in scene_views]
+    shapes = [(len(ids), *images.shape[1:3]) for _, ids in scene_views]
+    return replace(pictured, empty=concat_values(shares, shapes, usual=np.float32(0)))
 
 
 def _view_weights(splats: Splats, starts: Sequence[BlockStart]) -> Iterator[tuple[int, int, np.ndarray, np.ndarray]]:

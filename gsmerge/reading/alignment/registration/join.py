@@ -121,10 +121,10 @@ def concat_scenes(scenes: Sequence[Scene], photos: np.ndarray | None = None) -> 
         images=photos,
         pixels=_concat_pixels(scenes),
         names=tuple(name for scene in scenes for name in scene.names),
-        filled=_concat_values([scene.filled for scene in scenes], rows, usual=False),
+        filled=concat_values([scene.filled for scene in scenes], rows, usual=False),
         large_photos=_concat_large([scene.large_photos for scene in scenes]),
-        masks=None if photos is None else _concat_values([scene.masks for scene in scenes], grids, usual=True),
-        importance=_concat_values([scene.importance for scene in scenes], grids, usual=np.float32(1)),
+        masks=None if photos is None else concat_values([scene.masks for scene in scenes], grids, usual=True),
+        importance=concat_values([scene.importance for scene in scenes], grids, usual=np.float32(1)),
         region=scenes[0].region,
     )
 
@@ -142,7 +142,7 @@ def _concat_pixels(scenes: Sequence[Scene]) -> Pixels | None:
     return Pixels(np.concatenate(homes), np.concatenate(fronts), own=True)
 
 
-def _concat_values(
+def concat_values(
     values: Sequence[np.ndarray | None], shapes: Sequence[tuple[int, ...]], *, usual: bool | np.float32
 ) -> np.ndarray | None:
     """Concatenate values of scenes; a scene without values gets ``usual`` in its shape. None if no scene has values."""
