@@ -563,6 +563,6 @@ def run_parts(prepared: Prepared, plan: Plan) -> list[RunPart]:
     views, steps = len(prepared.scene), 0 if plan.fit.fit == "none" else plan.fit.steps
     build = RunPart("build", STAGE_STEPS * views, steps)
     count = usual_builds(has_target=plan.target_psnr is not None, rendered=prepared.reference.name == RENDERS)
-    trial = RunPart("trial", TRIAL_SHARE / 2 * build.stages, TRIAL_SHARE / 2 * steps)  # one of two rounds
+    trial = RunPart("trial", TRIAL_SHARE * build.stages, TRIAL_SHARE * steps)
     parts = [build] * (count + plan.levels - 1)
-    return [*parts, RunPart("input", INPUT_STEPS * views), *([trial] * 2 if plan.new_views else [])]
+    return [*parts, RunPart("input", INPUT_STEPS * views), *([trial] if plan.new_views else [])]

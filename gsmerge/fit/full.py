@@ -19,7 +19,7 @@ from gsmerge.fit.outside import veil_gradients
 from gsmerge.fit.report import FitReport, FitResult
 from gsmerge.fit.schedule import CLEARS, CUTS, GROWTH, FitRun, Schedule
 from gsmerge.fit.steps import Optimiser, make_optimiser
-from gsmerge.fit.survey import Survey, photo_mses, score_state, survey_photos
+from gsmerge.fit.survey import Survey, choose_scored_photos, photo_mses, score_state, survey_photos
 from gsmerge.kernels.elementary import log
 from gsmerge.kernels.gaussians.optimise import LOGIT, QUAT
 from gsmerge.raster.metrics import decibels
@@ -70,9 +70,8 @@ def fit_full(
     if has_room and job.edges is not None and job.fixed is None:
         split = split_at_edges(final, job.edges, job.count)
         if split is not final:
-            mse, split_mse = (
-                float(photo_mses(gaussians_of(s.x, s.splats.shN), fit.half).mean()) for s in (final, split)
-            )
+            photos = fit.half[choose_scored_photos(len(fit.half))]
+            mse, split_mse = (float(photo_mses(gaussians_of(s.x, s.splats.shN), photos).mean()) for s in (final, split))
             # photos may lose .5 dB where large Gaussians overlap, because two halves cover more than their parent
             final = split if split_mse <= SPLIT_LOSS * mse else final
     report = FitReport(
