@@ -3,7 +3,7 @@
 python benchmarks/captures.py SCENE OUT                    # plain: a Gaussian for each pixel, view by view
 python benchmarks/captures.py SCENE OUT --style anysplat   # or da3, depthsplat
 
-Captures (docs/internals/captures.md) are in ``scenes/train`` and ``scenes/eval`` below ``GSMERGE_DATA``, or else below
+Captures (docs/internals/stability.md) are in ``scenes/train`` and ``scenes/eval`` below ``GSMERGE_DATA``, or else below
 ``../shared``. An export has the capture's depth, confidence and colour. Its scales, rotations, opacities and offsets,
 which the depth network does not predict, follow from these with jitter. The bytes are the same every time. The other
 benchmarks import this file.
@@ -36,7 +36,7 @@ from gsmerge.types import Cameras, Gaussians
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL camera axes <-> OpenCV camera axes
 BORDER = 8  # pixels that da3 (of 256) and depthsplat leave out
 LPIPS_VIEWS = 4  # most target views of a scene on which LPIPS is measured, at equal intervals
-CAPTURES = "docs/internals/captures.md says how captures are made, and which files are not public"
+CAPTURES = "docs/internals/stability.md says how captures are made, and which files are not public"
 Rows = dict[str, np.ndarray]  # columns of Gaussians by name: means, quats, scales, opacities, sh0
 Record = dict[str, Any]
 

@@ -1,8 +1,7 @@
-"""Measure how near the kernels come to the limits of a machine, for docs/results/limit.md.
+"""Measure how near the kernels come to the limits of a machine, for a table of docs/results.md.
 
-python benchmarks/limit.py                                    # fox and fern
-python benchmarks/limit.py fern --page docs/results/limit.md  # put the tables into the page
-GSMERGE_TARGET=v3 python benchmarks/limit.py                  # kernels of another target
+python benchmarks/limit.py                    # fox and fern
+GSMERGE_TARGET=v3 python benchmarks/limit.py  # kernels of another target
 
 Each step of a real fit is timed. Another run counts the step's pairs of a pixel and a Gaussian. Needed pairs change the
 picture. Visited pairs are those on which the kernels work. The limit of a kernel is a time: the longer one of the time
@@ -24,7 +23,6 @@ import ctypes
 import inspect
 import json
 import os
-import re
 import runpy
 import subprocess
 import sys
@@ -467,18 +465,9 @@ def steps_table(machine: Machine, records: list[dict[str, Any]]) -> str:
     return make_table((*head, "of two threads, ms", "of the algorithm's limit"), rows)
 
 
-def write_page(path: Path, tables: dict[str, str]) -> None:
-    """Replace the tables of a page; a comment with its name stands before each table."""
-    text = path.read_text(encoding="utf-8")
-    for name, table in tables.items():
-        text = re.sub(rf"(<!-- {name} -->\n)(\|.*\n)*", lambda found, table=table: f"{found[1]}{table}\n", text)
-    path.write_text(text, encoding="utf-8")
-
-
 def main() -> None:
-    """Measure the machine and all scenes, and print the tables, and perhaps put them into the page."""
+    """Measure the machine and all scenes, and print the tables."""
     parser = make_parser(__doc__, "fox,fern")
-    parser.add_argument("--page", type=Path, help="page whose tables of this target are replaced")
     args = parser.parse_args()
     target, folders = Path(load_library()._name).stem.split("-")[-1], scene_folders(args.scenes)
     with tempfile.TemporaryDirectory() as name:
@@ -490,8 +479,6 @@ def main() -> None:
         f"pairs {target}": pairs_table(records),
         f"steps {target}": steps_table(machine, records),
     }
-    if args.page:
-        write_page(args.page, tables)
     print("\n\n".join(f"{key}\n\n{table}" for key, table in tables.items()))
 
 

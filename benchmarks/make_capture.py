@@ -1,4 +1,4 @@
-"""Make a capture of docs/internals/captures.md from public photos, their cameras and a checkout of IterMVS.
+"""Make a capture of docs/internals/stability.md from public photos, their cameras and a checkout of IterMVS.
 
 python benchmarks/make_capture.py instant-ngp/data/nerf/fox captures/scenes/eval/fox --itermvs IterMVS
 GSMERGE_DATA=captures python benchmarks/quality.py fox

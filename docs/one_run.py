@@ -1,11 +1,12 @@
-"""Write docs/internals/one-run.md and its picture, which follow a small scene step by step through a run.
+"""Write the part of docs/internals/architecture.md, and its picture, that follow a small scene through a run.
 
 python docs/one_run.py          # write the page and the picture if they differ from the program
 python docs/one_run.py --check  # only name the files that differ; the exit code is 1 if there are any
 
 The script records what functions of the package return while `gsmerge.compact` works, so all values are those of a real
-run. Each section of the page has its function, with its prose and its values. A sentence that may become untrue goes
-through :func:`say` with its condition. If the condition does not hold, the script stops and names the sentence.
+run. The prose of this part is here, and all other text of the page is written by hand. A sentence that may become
+untrue goes through :func:`say` with its condition. If the condition does not hold, the script stops and names the
+sentence.
 """
 
 from __future__ import annotations
@@ -30,12 +31,14 @@ from gsmerge.geometry.transforms import IDENTITY, covariances, project
 from gsmerge.research.generate import GenerateOptions, NoiseOptions, generate_scene
 
 DOCS = Path(__file__).parent
-PAGE, PICTURE = DOCS / "internals" / "one-run.md", DOCS / "images" / "one-run.jpg"
-NOTICE = "<!-- Made by docs/one_run.py from a run: change the text there and run it again. -->"
+PAGE, PICTURE = DOCS / "internals" / "architecture.md", DOCS / "images" / "one-run.jpg"
+# Comments before and after the part of the page that is made here
+START, END = "<!-- one run: made by docs/one_run.py from a run; change the text there -->\n", "\n<!-- end -->"
 VIEWS, WIDTH, HEIGHT, SEED = 4, 96, 64, 2
 VIEW, X, Y = 1, 38, 28  # the pixel that the page follows
 ROW = (VIEW * HEIGHT + Y) * WIDTH + X  # row of this pixel's Gaussian
 LINE = 120  # most characters of a line of the page
+DIAGONAL = ([0, 1, 2], [0, 1, 2])  # indices of the diagonal of a matrix [3,3]
 WATCHED = {  # functions that are recorded, by the module that calls them
     "gsmerge.reading.read_scene": ("align",),
     "gsmerge.road": ("make_plan", "build", "make_result"),
@@ -62,7 +65,7 @@ def main() -> int:
         print(f"docs/one_run.py: no longer true, rewrite it: {error}")
         return 1
     stale = []
-    if not PAGE.is_file() or PAGE.read_text(encoding="utf-8") != page:
+    if PAGE.read_text(encoding="utf-8") != page:
         stale.append(PAGE)
         if not check:
             PAGE.write_text(page, encoding="utf-8")
@@ -185,264 +188,202 @@ def say(sentence: str, holds: bool) -> str:
     return sentence
 
 
-def text(*sentences: str) -> str:
+def text(*sentences: str, indent: str = "") -> str:
     """Join sentences or parts of sentences to a paragraph, in lines of the page's length."""
-    return textwrap.fill(" ".join(sentences), LINE, break_long_words=False, break_on_hyphens=False)
+    return textwrap.fill(
+        " ".join(sentences), LINE, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False
+    )
 
 
-def entry(name: str, values: Any, row: Any = None, digits: int = 2) -> str:
-    """Return a line for an array, with its shape, its type and the values of one row; or for another value."""
-    if not isinstance(values, np.ndarray):
-        return f"- `{name}`: {values}"
-    shape = ", ".join(map(str, values.shape))
-    shown = np.asarray(values if row is None else values[row])
+def step(name: str, *sentences: str) -> str:
+    """Join the sentences of a step after its name."""
+    return " ".join([f"**{name}.**", *sentences])
+
+
+def entry(function: str, name: str, values: np.ndarray, row: Any, digits: int = 2) -> str:
+    """Return a row of the table: a function, an array with its shape, and one row of the array."""
+    shown = np.asarray(values[row])
     is_real = np.issubdtype(shown.dtype, np.floating)
     cells = [f"{round(float(cell), digits) + 0.0:.{digits}f}" if is_real else f"{cell}" for cell in shown.flat]
-    return f"- `{name}` [{shape}] {values.dtype}: {', '.join(cells)}"
+    return f"| `{function}` | `{name}` [{', '.join(map(str, values.shape))}] | {', '.join(cells)} |"
 
 
 def make_page(run: Run) -> str:
-    """Return the text of the page."""
-    sections = (head, align_section, prepare_section, plan_section, build_section, result_section)
-    return "\n\n".join(section(run) for section in sections) + "\n"
+    """Return the text of the page with a new block, between START and END."""
+    before, _, rest = PAGE.read_text(encoding="utf-8").partition(START)
+    _, found, after = rest.partition(END)
+    if not found:
+        raise ValueError(f"{PAGE.name}: expected {START.strip()} and {END.strip()}")
+    return f"{before}{START}\n{make_block(run)}{END}{after}"
 
 
-def head(run: Run) -> str:
-    """Write the beginning of the page: which scene is compacted, and what the picture shows."""
-    count = run.prepared.input_scene.num_gaussians
-    return "\n\n".join([
-        f"{NOTICE}\n\n# One run",
+def make_block(run: Run) -> str:
+    """Return the block of the page that follows the run: the picture, a table of values, and a list of the steps."""
+    steps = [*first_steps(run), *build_steps(run), result_step(run)]
+    items = [text(f"{number}. {words}", indent="   ") for number, words in enumerate(steps, 1)]
+    return "\n\n".join([*head(run), values_table(run), "\n".join(items)]) + "\n"
+
+
+def head(run: Run) -> list[str]:
+    """Write the beginning of the block: which scene is compacted, and what the picture and the table show."""
+    return [
         text(
-            f"This page says what each step of `gsmerge.compact(folder)` makes of a scene of {count:,} Gaussians.",
-            "The [generator](lab.md) makes the scene:",
-            f"{VIEWS} photos of {WIDTH} x {HEIGHT} pixels of a room, their cameras, and a `scene.ply` with one",
-            "Gaussian per pixel, with the errors of a predicted depth.",
-            "[Conventions](../reference/conventions.md) explain names and words.",
-        ),
-        text(
-            "Lists give arrays with shape and type, and the values of one row of each array.",
-            f"This row belongs to pixel ({X}, {Y}) of view {VIEW}, or to what became of this pixel.",
+            f"This scene has {VIEWS} photos of {WIDTH} x {HEIGHT} pixels of a room, their cameras, and",
+            f"{run.prepared.input_scene.num_gaussians:,} Gaussians, one for each pixel, with the errors of a predicted",
+            "depth ([`generate`](networks.md#generate) made it). The picture shows one view at each step. Ellipses are",
+            "contours of Gaussians at one standard deviation: yellow for this view alone, blue for several views, and",
+            "pink for the Gaussian of the table.",
         ),
         f"![One view: photo, superpixels, Feature Gaussians, merged, fitted, result](../images/{PICTURE.name})",
         text(
-            f"All panels show view {VIEW}. Ellipses are contours of Gaussians at one standard deviation: yellow for",
-            "Gaussians of this view alone, blue for several views, pink for what became of the pixel.",
+            f"The table has the row of each array that belongs to pixel ({X}, {Y}) of view {VIEW}, or to what became",
+            "of it.",
         ),
+    ]
+
+
+def values_table(run: Run) -> str:
+    """Write the table of arrays, in the order of the steps."""
+    made, prepared, ply = run.made, run.prepared, run.arguments["align"][0]
+    features, merged, fitted = made["correct"], made["merge"], made["fit_scene"]
+    return "\n".join([
+        "| function | array | row |",
+        "|---|---|---|",
+        entry("align", "ply.gaussians.means", ply.gaussians.means, ROW),
+        entry("align", "pixel_ids", made["align"].pixel_ids, ROW),
+        entry("prepare", "scene.gaussians.means", prepared.scene.gaussians.means, ROW),
+        entry("segment_scene", "groups.labels", made["segment_scene"].groups.labels, (VIEW, Y, X)),
+        entry("correct", "features.covars", features.covars, (run.feature, *DIAGONAL), 4)[:-2] + " (diagonal) |",
+        entry("match", "clusters", made["match"].clusters, run.feature),
+        entry("merge", "features.means", merged.means, run.merged),
+        entry("decode_merged", "gaussians.scales", made["decode_merged"].gaussians.scales, run.merged, 4),
+        entry("fit_scene", "gaussians.scales", fitted.gaussians.scales, run.fitted[0], 4),
+        entry("make_result", "gaussians.means", run.result.gaussians.means, run.written),
     ])  # fmt: skip
 
 
-def align_section(run: Run) -> str:
-    """Write the section on which row is which pixel."""
-    ply, camera_file = run.arguments["align"][:2]
-    made = run.made["align"]
-    recovery = made.recovery
-    return "\n\n".join([
-        "## 1. align: which row is which pixel",
-        text(
-            "[`align_rows.py`](../../gsmerge/reading/alignment/align_rows.py) gets rows, cameras and photos,",
-            "and returns the pixel of every row if the rows show it.",
-        ),
-        "\n".join([
-            entry("ply.gaussians.means", ply.gaussians.means, ROW),
-            entry("ply.gaussians.opacities", ply.gaussians.opacities, ROW),
-            entry("camera_file.viewmats", camera_file.viewmats, (VIEW, slice(3), 3)) + " (column 3 of view 1)",
-            entry("result.pixel_ids", made.pixel_ids, ROW),
-        ]),
-        text(
-            "A `.ply` does not say which pixel a row belongs to. `align` assumes an order, projects Gaussians into the",
-            "cameras of their pixels, and measures their distance from the pixels' centres.",
+def first_steps(run: Run) -> list[str]:
+    """Write the steps before anything is built: the scene is read and prepared, and the run is planned."""
+    prepared, plan, made = run.prepared, run.made["make_plan"], run.made["align"]
+    pixels, limits, recovery = WIDTH * HEIGHT, plan.limits, made.recovery
+    first = int(limits.per_view * plan.superpixels.start_share)
+    scene = prepared.input_scene
+    own = scene.has_own_pixels and scene.pixels.shown.all() and int(scene.pixels.fronts[VIEW, Y, X]) == ROW
+    return [
+        step(
+            "Read",
+            "`align` assumes an order of the rows, and measures how far the Gaussians then lie from their pixels. For",
             say(
-                f'Here the first reading, "{recovery.layout.description}", decides: the median distance is',
+                f'"{recovery.layout.description}" the median distance is {recovery.alignment.middle_px:.2f} pixels,',
                 recovery.layout.ids is None and recovery.frame is IDENTITY,
             ),
-            f"{recovery.alignment.middle_px:.2f} pixels.",
             say(
-                f"So row {ROW} is pixel ({VIEW} · {HEIGHT} + {Y}) · {WIDTH} + {X}, and each view has Gaussians of",
-                int(made.pixel_ids[ROW]) == ROW and run.prepared.input_scene.has_own_pixels,
-            ),
-            say(
-                "its own, one in front of every pixel.",
-                bool(run.prepared.input_scene.pixels.shown.all())
-                and int(run.prepared.input_scene.pixels.fronts[VIEW, Y, X]) == ROW,
+                f"so row {ROW} is pixel ({VIEW} · {HEIGHT} + {Y}) · {WIDTH} + {X}, and each view has Gaussians of its"
+                " own.",
+                int(made.pixel_ids[ROW]) == ROW and bool(own),
             ),
         ),
-    ])  # fmt: skip
-
-
-def prepare_section(run: Run) -> str:
-    """Write the section on the facts that are known before the first choice."""
-    prepared = run.prepared
-    agreement, frame = prepared.agreement, prepared.frame
-    return "\n\n".join([
-        "## 2. prepare: what is known first",
-        text(
-            "[`prepare/prepare_scene.py`](../../gsmerge/prepare/prepare_scene.py) moves the scene into its canonical",
-            "frame and collects facts.",
-        ),
-        "\n".join([
-            entry("frame.origin", frame.origin),
-            entry("frame.unit", frame.unit),
-            entry("scene.gaussians.means", prepared.scene.gaussians.means, ROW),
-            entry("scene.images", prepared.scene.images, (VIEW, Y, X)),
-            entry("reference.name", prepared.reference.name),
-            entry("agreement.confirmed", f"{agreement.confirmed:.2f}"),
-            entry("moved", prepared.moved),
-        ]),
-        text(
-            "The frame has its origin at the median of the means. The frame's unit is the power of two nearest to the",
-            "median depth, so thresholds mean the same in every scene.",
+        step(
+            "Prepare",
             say(
                 "The photos show what the Gaussians show, so the fit and all scores refer to them.",
                 prepared.reference.name == "photos" and prepared.reference.score_views == tuple(range(VIEWS)),
             ),
-            f"Other views confirm the depth of {100 * agreement.confirmed:.0f} % of the pixels.",
-            say("The photos agree, so no exposure and no camera changes.",
+            f"Other views confirm the depth of {100 * prepared.agreement.confirmed:.0f} % of the pixels.",
+            say("The photos agree with each other, so no camera or exposure is changed.",
                 not prepared.moved and prepared.reference.photo_files is None),
         ),
-    ])  # fmt: skip
-
-
-def plan_section(run: Run) -> str:
-    """Write the section on the decisions before anything is built."""
-    plan, pixels = run.made["make_plan"], WIDTH * HEIGHT
-    limits, first = plan.limits, int(plan.limits.per_view * plan.superpixels.start_share)
-    return "\n\n".join([
-        "## 3. make_plan: every decision",
-        text(
-            "[`plan.py`](../../gsmerge/plan.py) turns options and facts into a `Plan`, which the steps below get in",
-            "place of `CompactOptions`.",
-        ),
-        "\n".join([
-            entry("limits.per_view", limits.per_view),
-            entry("limits.default", f"{limits.default:,}"),
-            entry("superpixels.start_share", plan.superpixels.start_share),
-            entry("decode.k", plan.decode.k),
-            entry("match.match", plan.match.match),
-            entry("fit.steps", plan.fit.steps),
-            entry("checkpoint", plan.checkpoint),
-        ]),
-        text(
+        step(
+            "Plan",
             say(
-                "No option limits the number of Gaussians, and every Gaussian belongs to a pixel, so"
-                f" {plan.settings['superpixels']} of the",
+                "No option limits the number of Gaussians, and every Gaussian belongs to a pixel, so `make_plan` allows"
+                f" {plan.settings['superpixels']} of the {pixels:,} pixels of each view, {limits.default:,} in all.",
                 limits.exact is None and not plan.keeps_fidelity and plan.target_psnr is None,
             ),
-            f"{pixels:,} pixels of a view may become Gaussians: {limits.per_view} for each view,",
-            f"and {limits.default:,} in all. The fit has {plan.fit.steps} steps. Its start is made of only",
-            f"{first} superpixels for each view, and the fit adds Gaussians where renders differ most from the",
             say(
-                "photos.",
+                f"The fit starts with only {first} superpixels of each view, because it adds Gaussians itself where"
+                " renders differ most from the photos.",
                 plan.fit.grows and not plan.merges_pairs,
             ),
             say(
-                "Networks are not used, since a fit to photos gains more.",
-                plan.checkpoint is None and run.prepared.reference.of_views,
+                "Networks are not used, because a fit to photos gains more.",
+                plan.checkpoint is None and prepared.reference.of_views,
             ),
         ),
-    ])  # fmt: skip
+    ]  # fmt: skip
 
 
-def build_section(run: Run) -> str:
-    """Write the section on the steps that build the Gaussians, the arrows of the pipeline."""
+def build_steps(run: Run) -> list[str]:
+    """Write the steps that build the Gaussians, the arrows of the pipeline."""
     made, at = run.made, run.feature
-    groups, features, matches = made["segment_scene"].groups, made["correct"], made["match"]
+    features, matches = made["correct"], made["match"]
     merged, decoded, fitted = made["merge"], made["decode_merged"], made["fit_scene"]
-    plan, children = made["make_plan"], run.fitted
-    size = int(np.diff(features.starts)[at])
+    plan, report, written = made["make_plan"], made["fit_scene"].report, made["build"].gaussians
     own = np.flatnonzero(matches.clusters == matches.clusters[at])
     faint = int((features.gains < 1).sum())
-    report, written = fitted.report, made["build"].gaussians
     before, after = ({mean.tobytes() for mean in some.means} for some in (fitted.gaussians, written))
-    others = [row for row, mean in enumerate(written.means) if mean.tobytes() not in before]
-    return "\n\n".join([
-        "## 4. build: the arrows",
-        text(
-            "[`pipeline.py`](../../gsmerge/pipeline.py) calls the functions of `stages/` in turn, and `fit/` after",
-            "`decode_merged`. Each line begins with a function. Not shown are `assign` (a row belongs to the",
-            "superpixel of its pixel) and `refine` (only networks refine).",
+    return [
+        step(
+            "Superpixels",
+            "Superpixels follow borders of colours, because a Gaussian has one colour.",
+            f"The pixel lies in superpixel {run.label}, which has {int(np.diff(features.starts)[at])} pixels.",
         ),
-        "\n".join([
-            entry("segment_scene: groups.labels", groups.labels, (VIEW, Y, X)),
-            entry("encode, correct: features.means", features.means, at),
-            entry("encode, correct: features.covars", features.covars, (at, [0, 1, 2], [0, 1, 2]), 4) + " (diagonal)",
-            entry("encode, correct: features.gains", features.gains, at),
-            entry("match: clusters", matches.clusters, at),
-            entry("merge: features.means", merged.means, run.merged),
-            entry("decode_merged: gaussians.scales", decoded.gaussians.scales, run.merged, 4),
-            entry("fit_scene: gaussians.scales", fitted.gaussians.scales, children[0], 4),
-            *[entry("fill_between: gaussians.means", written.means, row) + " (a new one)" for row in others[:1]],
-        ]),
-        text(
-            "**Superpixels** follow colour borders in the photo, because a Gaussian has one colour.",
-            say(f"Each view has {groups.counts[0]} superpixels.", len(set(groups.counts)) == 1),
-            f"The pixel lies in superpixel {run.label}, which has {size} pixels.",
-            "**`encode`** gives each superpixel a Feature Gaussian with the mean and the covariance of its Gaussians,",
-            "weighted by their opacities.",
-            f"**`correct`** makes {faint} of the {len(features)} Feature Gaussians fainter, because more views see",
-            say("through each of them than confirm its depth.", plan.weakens and faint > 0),
-        ),
-        text(
-            "**`match`** finds Feature Gaussians of different views that overlap and have similar colours, and so",
+        step(
+            "Encode",
+            "A Feature Gaussian has the mean and the covariance of the superpixel's Gaussians, weighted by their",
             say(
-                "show one surface. The pixel's cluster has one Feature Gaussian of each of the views"
+                f"opacities. `correct` makes {faint} of the {len(features)} Feature Gaussians fainter,"
+                " because more views see through them than confirm their depth.",
+                plan.weakens and faint > 0,
+            ),
+        ),
+        step(
+            "Match and merge",
+            "Feature Gaussians of different views match if they overlap and have similar colours. The pixel's cluster",
+            say(
+                "has one of each of the views"
                 f" {', '.join(map(str, features.views[own][:-1]))} and {features.views[own][-1]}.",
                 len({*features.views[own]}) == len(own) > 1 and plan.match.match == "overlap",
             ),
-            f"**`merge`** turns {len(features)} Feature Gaussians into {len(merged)}, one for each cluster; `views` is",
-            say("-1 if several views were merged.", int(merged.views[run.merged]) == -1),
-            "**`decode_merged`** makes one Gaussian of each merged one,",
-            say("since K is 1.", plan.decode.k == 1 and len(decoded.gaussians) == len(merged)),
-            "The opacity keeps the optical depth of the members of the cluster, times the gain.",
+            f"`merge` makes {len(merged)} of the {len(features)} Feature Gaussians, one for each cluster.",
         ),
-        text(
-            "**`fit_scene`** changes all parameters so that renders look like the photos. Half way the fit splits the",
-            "Gaussians with the largest errors, and later drops faint Gaussians.",
-            f"{len(fitted.gaussians):,} Gaussians are left, {len(children)} of which come from the pixel's Gaussian.",
-            "The first steps draw a quarter of a photo's pixels, and leave out patches of the photos.",
-            f"The PSNR of the patches rises from {report.holdout_before:.1f} to {report.holdout_after:.1f} dB,",
+        step(
+            "Decode",
+            f"Each of the {len(merged)} becomes one Gaussian,",
+            say("because K is 1.", plan.decode.k == 1 and len(decoded.gaussians) == len(merged)),
+        ),
+        step(
+            "Fit",
+            f"Half way the fit splits the Gaussians with the largest errors. It ends with {len(fitted.gaussians):,},",
+            f"{len(run.fitted)} of which come from the pixel's Gaussian. On patches of the photos that the first steps",
+            "leave out, the PSNR rises from",
             say(
-                "so the fit is accepted.",
+                f"{report.holdout_before:.1f} to {report.holdout_after:.1f} dB, so the fit is accepted.",
                 report.accepted and report.method == "full",
             ),
         ),
-        text(
-            f"**`split_unseen`** finds {len(before - after)} Gaussians that change no photo by more than rounding",
-            "does, and they are dropped. **`fill_between`** would fill places that cameras between the photos see",
-            say("empty, but this scene has none.", not others),
+        step(
+            "Prune and fill",
+            f"{len(before - after)} Gaussians change no photo by more than rounding does, and are dropped. Cameras",
+            say("between the photos see no empty places, so nothing is filled.", not after - before),
         ),
-    ])  # fmt: skip
+    ]  # fmt: skip
 
 
-def result_section(run: Run) -> str:
-    """Write the section on the result and its quality."""
-    result, new = run.result, run.result.report.new_views
-    gaussians, report, child = result.gaussians, result.report, run.written
-    return "\n\n".join([
-        "## 5. make_result: what comes out",
-        text(
-            "[`results/candidate.py`](../../gsmerge/results/candidate.py) moves the Gaussians into the world of",
-            "the file and scores them; [`results/result.py`](../../gsmerge/results/result.py) scores the input.",
+def result_step(run: Run) -> str:
+    """Write the step that makes the result, with its quality."""
+    report = run.result.report
+    return step(
+        "Result",
+        f"{len(run.result.gaussians):,} Gaussians replace {run.prepared.input_scene.num_gaussians:,}. The PSNR of the",
+        say(
+            f"photos rises from {report.psnr_before:.1f} to {report.psnr_after:.1f} dB, because the input has wrong"
+            " depths.",
+            report.psnr_after > report.psnr_before,
         ),
-        "\n".join([
-            entry("result.gaussians.means", gaussians.means, child),
-            entry("result.gaussians.opacities", gaussians.opacities, child),
-            entry("report.psnr_before", f"{report.psnr_before:.2f}"),
-            entry("report.psnr_after", f"{report.psnr_after:.2f}"),
-            entry("report.new_views", f"about {new.gain:+.1f} dB"),
-        ]),
-        text(
-            f"{len(gaussians):,} Gaussians replace {run.prepared.input_scene.num_gaussians:,}.",
-            say(
-                "The result shows the photos better than the input, which has wrong depths.",
-                report.psnr_after > report.psnr_before,
-            ),
-            "The fit has seen these photos, so the report also estimates the gain of new views, by",
-            say(
-                "fits that leave photos out.",
-                report.worse is None and new.low > 0,
-            ),
-        ),
-    ])  # fmt: skip
+        "The fit has seen these photos, so a trial leaves photos out, and estimates that new views gain",
+        say(f"about {report.new_views.gain:.1f} dB.", report.worse is None and report.new_views.low > 0),
+    )
 
 
 # The picture

@@ -3,7 +3,7 @@
     python examples/01_make_scene.py made
 
 A furnished room is photographed from an arc of views, and every pixel becomes one Gaussian with the errors of a
-predicted depth (docs/internals/lab.md). `gsmerge lab generate` makes many such scenes. The folder contains:
+predicted depth (docs/internals/networks.md). `gsmerge lab generate` makes many such scenes. The folder contains:
 
     scene.ply          one Gaussian per pixel, 17 columns, view-major and row-major
     transforms.json    the cameras (nerfstudio: camera to world, OpenGL axes)

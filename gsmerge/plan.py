@@ -362,7 +362,7 @@ def keeps_fidelity(scene: SceneSize, options: CompactOptions) -> bool:
     With few Gaussians per pixel, no usual share of the Gaussians is right: a scene that is compact already needs most
     of its Gaussians, and a scene of many small Gaussians needs only a few. Without photos, the PSNR of the result
     against renders of the input has to be ``FIDELITY_PSNR``. With photos, the PSNR of the result on the photos may be
-    ``FIDELITY_LOSS`` dB lower than that of the input. Measurements are in docs/internals/notebook.md.
+    ``FIDELITY_LOSS`` dB lower than that of the input. Measurements are in docs/internals/decisions.md.
     """
     # with half a Gaussian per pixel or more, the usual share of the Gaussians is enough to show the photos
     is_dense = scene.has_own_pixels or scene.num_gaussians >= 0.5 * scene.num_views * scene.pixels_per_view > 0

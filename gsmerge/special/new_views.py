@@ -44,7 +44,8 @@ USUAL_DENSITY, SHARE_POWER = parse_share(SHARE), 0.3
 # The expected gain of new views is a weighted mean of two gains: the gain of the result's own photos, as far as depth
 # is confirmed, with the weight OWN_WEIGHT, and the gain of left-out photos in the trial. On ten captures and on five
 # others, the true gain of at least 80 % of the results lies between these two gains, or at most SPREAD dB outside of
-# them (docs/internals/notebook.md). Nothing is known about results with more than MOST_SHARE Gaussians for each pixel
+# them (docs/internals/decisions.md#new-views). Nothing is known about results with more than MOST_SHARE Gaussians for
+# each pixel
 OWN_WEIGHT, SPREAD, MOST_SHARE = 0.2, 1.25, 0.1
 
 
@@ -137,7 +138,7 @@ def _score_round(prepared: Prepared, views: Sequence[int], plan: Plan, share: fl
     superpixels = max(1, round(share * small.pixels_per_view))
     trial_plan = left_out.plan(plan, superpixels=superpixels, k=1, fit_steps=min(TRIAL_STEPS, plan.fit.steps))
     # The fit draws no views from outside, and nothing is pruned. Views from outside and pruning hardly change the score
-    # (docs/internals/notebook.md)
+    # (docs/internals/decisions.md#new-views)
     fit = replace(trial_plan.fit, tuning=replace(trial_plan.fit.tuning, outside_from=1.0))
     compacted = build(left_out.rest, replace(trial_plan, fit=fit, is_trial=True), None).gaussians
     scored = small.file_gaussians, left_out.rows, compacted

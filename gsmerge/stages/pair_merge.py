@@ -21,7 +21,7 @@ from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Gaussians
 
-# Chosen on training scenes by the PSNR of views from random cameras (docs/internals/notebook.md#bare-files)
+# Chosen on training scenes by the PSNR of views from random cameras (docs/internals/decisions.md#bare-files)
 COLOR_WEIGHT = 0.6  # weight of squared differences of sh0 in a cost, whose other part is a divergence in nats
 # Costs of merging are multiplied by the masses to one of the POWERS. Power 1 keeps what is large in pictures, which
 # suits scenes. Power 0.3 keeps detail, which suits objects

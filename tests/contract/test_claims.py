@@ -27,7 +27,7 @@ from gsmerge.kernels.raster import blend
 from gsmerge.networks.checkpoint import IN_PACKAGE, load_checkpoint
 from gsmerge.networks.options import RESIDUAL, SLOTS
 from gsmerge.prepare import compare_photos as compare
-from gsmerge.prepare import confirm_depths, draw_outside, exposure, move_poses, scene_size
+from gsmerge.prepare import confirm_depths, draw_outside, exposure, scene_size
 from gsmerge.prepare import fill_holes as holes
 from gsmerge.prepare.prepare_scene import LEAST_VIEWS
 from gsmerge.raster import metrics, photos, tiled_view
@@ -100,9 +100,9 @@ CLAIMS: dict[str, tuple[str, ...]] = {
         " pixels",
         f"After {percent(RATES.outside_from)} of the steps, every {word(RATES.outside_every, ordinal=True)} step also"
         " draws the scene [from outside]",
-        f"{move_poses.POSE_PIXELS:,} pixels of a view are looked up in up to {word(move_poses.POSE_NEIGHBOURS)} other"
-        " views",
-        f"bring the greys together at {word(len(move_poses.SIDES))} sizes",
+        f"a weight that grows from 0 to {RATES.edge_weight:g} over the run",
+        f"(every {word(RATES.outside_every, ordinal=True)}, {outside.PLACES} places)",
+        f"{fit_pairs.RENDERS_STEP:g} / sqrt(share of Gaussians kept)",
     ),
     LARGE: (
         f"Scenes of more than {million(plan.WHOLE_GAUSSIANS)} Gaussians with pixels are compacted in blocks of views"
@@ -123,11 +123,6 @@ CLAIMS: dict[str, tuple[str, ...]] = {
         f"heads for K = {', '.join(map(str, SLOTS))};",
         f"| 0.6 MB, {load_checkpoint(IN_PACKAGE['shipped']).networks.num_parameters:,} parameters"
         f" | 1.0 MB, {load_checkpoint(IN_PACKAGE['paper']).networks.num_parameters:,} parameters |",
-    ),
-    "docs/internals/notebook.md": (
-        f"a weight that grows from 0 to {RATES.edge_weight:g} over the run",
-        f"(**kept**: every {word(RATES.outside_every, ordinal=True)}, {outside.PLACES})",
-        f"{fit_pairs.RENDERS_STEP:g} / sqrt(share of Gaussians kept)",
     ),
     COMPACT: (
         f"--effort draft`: {plan.EFFORTS['draft'].steps} steps, no merging across views",
@@ -265,7 +260,7 @@ TABLES: dict[str, dict[str, dict[str, Any]]] = {
         "`--set superpixels=1%`": {"superpixels": "1%"}, "`--budget 2%`": {"budget": "2%"}, "the defaults": {},
         "`--k 2`": {"k": 2}, "`--budget auto`": {"budget": "auto"}, "`--k 4`": {"k": 4},
     },
-    "docs/internals/plugins.md": {
+    "docs/internals/adding.md": {
         f"`{name}`": {"method": name} | ({} if name.startswith("unmerged") else {"budget": "4.4%"})
         for name in sorted({*method_names()} - {"splat-transform"})
     },
@@ -295,4 +290,4 @@ def test_tables_of_the_example_are_those_of_today(
     (line,) = [line for line in (ROOT / page).read_text("utf-8").splitlines() if line.startswith(f"| {row}")]
     cells = [cell.strip() for cell in line.strip("|").split("|")]
     assert f"{quality.psnr:.1f} dB" in cells
-    assert page.endswith("plugins.md") or f"{len(gaussians):,}" in cells
+    assert page.endswith("adding.md") or f"{len(gaussians):,}" in cells

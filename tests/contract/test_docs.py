@@ -187,7 +187,7 @@ def test_every_option_has_help(name: str) -> None:
 
 
 def test_every_method_is_described() -> None:
-    text = read("docs/internals/plugins.md")
+    text = read("docs/internals/adding.md")
     assert [method for method in method_names() if f"| `{method}` |" not in text] == []
 
 
@@ -262,7 +262,7 @@ def test_stability_cases_name_tests_that_are_there(root: Path) -> None:
 def test_generator_names_every_range(root: Path) -> None:
     from gsmerge.research.generate import NoiseOptions
 
-    text = (root / "docs" / "internals" / "lab.md").read_text()
+    text = (root / "docs" / "internals" / "networks.md").read_text()
     assert [f.name for f in fields(NoiseOptions) if f"`{f.name}`" not in text] == []
 
 

@@ -1,4 +1,4 @@
-"""The example of docs/internals/plugins.md, laid out as an installer leaves it, adds its method and its command.
+"""The example of docs/internals/adding.md, laid out as an installer leaves it, adds its method and its command.
 
 In processes of their own, about a second each: a package is found when its interpreter starts.
 """
@@ -16,7 +16,7 @@ import pytest
 
 from gsmerge import read_ply
 
-PAGE = Path(__file__).parents[2] / "docs" / "internals" / "plugins.md"
+PAGE = Path(__file__).parents[2] / "docs" / "internals" / "adding.md"
 
 
 @pytest.fixture

@@ -29,7 +29,7 @@ class NoiseOptions:
     """Ranges from which each scene's values are drawn: sizes of a network's errors, and habits of its exporter.
 
     Depth errors are standard deviations of the logarithm of depth. These standard deviations are about equal to
-    relative errors of depth. docs/internals/lab.md compares the ranges with real exports.
+    relative errors of depth. docs/internals/networks.md lists the ranges.
     """
 
     view_bias: Range = (0.0002, 0.02)  # scale error of a view
