@@ -98,7 +98,8 @@ def read_scene(
 
     Args:
         path: The ``.ply``, or a folder that has it.
-        *more: Other scenes of the same place, which are joined with the first, in its frame (docs/guide/sharp.md).
+        *more: Other scenes of the same place, which are joined with the first, in its frame
+            (docs/guide/after-a-model.md).
         cameras: Camera file or folder, or "none". If None, cameras are searched beside the ``.ply``, with a warning if
             they do not fit.
         images: Folder of images, an ``.npz`` that holds images, or "none". If None, images are searched as cameras are.

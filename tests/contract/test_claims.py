@@ -55,9 +55,9 @@ from gsmerge.stages import fit_pairs, sky
 ROOT = Path(__file__).parents[2]
 FIT, RATES, PAPER = FitOptions(), Tuning(), RECIPES["paper"]
 DECISIONS, LARGE, NETWORKS = (f"docs/internals/{name}.md" for name in ("decisions", "large-scenes", "networks"))
-COMPACT, CONVERT, EVALUATE, HOW_MANY, PHOTOS, STATES, VIEW, SHARP = (
+COMPACT, CONVERT, EVALUATE, HOW_MANY, PHOTOS, MANY_SCENES, VIEW, AFTER_A_MODEL = (
     f"docs/guide/{name}.md"
-    for name in ("compact", "convert", "evaluate", "how-many", "photos", "states", "view", "sharp")
+    for name in ("compact", "convert", "evaluate", "how-many", "photos", "many-scenes", "view", "after-a-model")
 )
 CONVENTIONS, EXPORTERS, FORMATS, REPORT = (
     f"docs/reference/{name}.md" for name in ("conventions", "exporters", "formats", "report")
@@ -185,7 +185,7 @@ CLAIMS: dict[str, tuple[str, ...]] = {
         f"exposures differ by more than {percent(exposure.DIFFERENT)} at random",
         f"A white pixel counts as {word(int(types.PROTECTED))}",
     ),
-    STATES: (f"the photos of at most {ExtendOptions().max_views} views",),
+    MANY_SCENES: (f"the photos of at most {ExtendOptions().max_views} views",),
     VIEW: (
         f"more than {splats.MAX_GAUSSIANS:,} Gaussians",
         f"Of more than {data.MAX_SHOWN_VIEWS} views",
@@ -193,7 +193,7 @@ CLAIMS: dict[str, tuple[str, ...]] = {
         f"at most {drawings.GIF_SIDE} pixels a side",
         f"a second shows {drawings.FPS:g} frames, or {drawings.GIF_FPS:g} frames of a GIF",
     ),
-    SHARP: (f"Each photo needs {register.MIN_MATCHES} points in common with another one",),
+    AFTER_A_MODEL: (f"Each photo needs {register.MIN_MATCHES} points in common with another one",),
     CONVENTIONS: (
         f"a low-pass adds a variance of {tiled_view.EPS2D:g} square pixels",
         f"larger ones than {blend.MAX_ALPHA:g} are set to {blend.MAX_ALPHA:g}",
