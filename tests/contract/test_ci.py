@@ -8,73 +8,27 @@ import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
-import typer.main
 from scripts import load_script
 
 from gsmerge import __version__
-from gsmerge.cli.app import app
 from gsmerge.kernels.build import find_platform
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 PROJECT = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
-COMMANDS: dict[str, Any] = typer.main.get_command(app).commands  # type: ignore[attr-defined]
 SHELL = ("/bin/bash", "-euo", "pipefail", "-c")
 
 pytestmark = pytest.mark.skipif(not Path(SHELL[0]).exists(), reason="needs bash")
 
 
-def find_block(words: str, **page: Path) -> str:
-    block: str = load_script(ROOT / "tools" / "readme_block.py").find_block(words, **page)
-    return block
-
-
-def write_program(path: Path, lines: str) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(f"#!/bin/bash\n{lines}\n", encoding="utf-8")
-    path.chmod(0o755)
-
-
-def run_block(block: str, folder: Path, failing: str = "none") -> list[str]:
-    """Run a block with programs that only write down how they were called; one of them fails."""
-    note = f'echo "{{}} $*" >> "{folder}/calls"; [ {{}} != {failing} ]'
-    write_program(folder / "bin" / "python3", note.replace("{}", "python3"))
-    for name in ("pip", "python", "gsmerge"):
-        write_program(folder / ".venv" / "bin" / name, note.replace("{}", name))
-    env = {"PATH": f"{folder}/bin:{os.environ['PATH']}"}
-    code = subprocess.run([*SHELL, block], cwd=folder, env=env, check=False).returncode
-    assert (code == 0) == (failing == "none")
-    return (folder / "calls").read_text(encoding="utf-8").splitlines()
-
-
-def test_block_of_the_tests_runs_as_a_whole(tmp_path: Path) -> None:
-    made, installed, tested = run_block(find_block("-m pytest"), tmp_path)
-    assert made == "python3 -m venv .venv"
-    assert installed == "pip install -q -c constraints.txt -e .[test]"
-    assert tested == "python -m pytest"
-
-
-def calls_of(*tasks: str) -> list[str]:
-    """Return the commands of tasks, as :func:`run_block` notes them."""
-    calls = [call for task in tasks for call in load_script(ROOT / "tasks.py").TASKS[task]]
-    return [" ".join(call).replace("python -m venv", "python3 -m venv") for call in calls]
-
-
-@pytest.mark.parametrize(
-    ("line", "steps", "tasks"),
-    [
-        ("python3 tasks.py setup tests\n", "-m pytest", ("setup", "tests")),
-        ("python3 tasks.py demo\n", "examples/01_make_scene.py", ("demo",)),
-    ],
-)
-def test_short_line_of_a_block_runs_the_commands_that_are_written_out_below(
-    line: str, steps: str, tasks: tuple[str, ...], tmp_path: Path
-) -> None:
-    assert find_block(line.strip()) == line
-    assert run_block(find_block(steps), tmp_path) == calls_of(*tasks)
+def test_lines_of_the_readme_are_tasks() -> None:
+    """One line installs and does the main job, and one installs and runs the tests."""
+    lines = re.findall(r"^```bash\n(.*?)\n```$", README, re.MULTILINE | re.DOTALL)
+    assert lines == ["python3 tasks.py demo", "python3 tasks.py setup tests"]
+    tasks = load_script(ROOT / "tasks.py").TASKS
+    assert [name for line in lines for name in line.split()[2:] if name not in tasks] == []
 
 
 def test_tasks_use_the_python_that_setup_installs(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -92,20 +46,9 @@ def test_tasks_use_the_python_that_setup_installs(monkeypatch: pytest.MonkeyPatc
     assert programs == [sys.executable]
 
 
-def test_commands_of_the_tests_stop_where_one_fails(tmp_path: Path) -> None:
-    assert run_block(find_block("-m pytest"), tmp_path, failing="pip")[-1].startswith("pip install")
-
-
-def test_block_of_the_main_job_runs_as_a_whole(tmp_path: Path) -> None:
-    calls = [call.split()[:2] for call in run_block(find_block("examples/01_make_scene.py"), tmp_path)]
-    install, make = ["pip", "install"], ["python", "examples/01_make_scene.py"]
-    assert calls == [["python3", "-m"], install, make, ["gsmerge", "compact"], ["gsmerge", "render"]]
-
-
-def test_ci_script_runs_the_block_of_the_tests() -> None:
+def test_ci_script_runs_the_readmes_line_of_the_tests() -> None:
     script = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
-    assert 'commands=$(python3 tools/readme_block.py "tasks.py setup tests")' in script
-    assert 'bash -euo pipefail -c "$commands"' in script
+    assert "\npython3 tasks.py setup tests" in script
     assert "run: .ci/run" in (ROOT / ".github" / "workflows" / "ci.yml").read_text(encoding="utf-8")
 
 

@@ -26,8 +26,7 @@ from gsmerge.io.formats import ply
 from gsmerge.kernels.raster import blend
 from gsmerge.networks.checkpoint import IN_PACKAGE, load_checkpoint
 from gsmerge.networks.options import RESIDUAL, SLOTS
-from gsmerge.prepare import compare_photos as compare
-from gsmerge.prepare import confirm_depths, draw_outside, exposure, scene_size
+from gsmerge.prepare import confirm_depths, exposure, scene_size
 from gsmerge.prepare import fill_holes as holes
 from gsmerge.prepare.prepare_scene import LEAST_VIEWS
 from gsmerge.raster import metrics, photos, tiled_view
@@ -36,9 +35,8 @@ from gsmerge.reading.alignment import score
 from gsmerge.reading.alignment import score as cameras_off
 from gsmerge.reading.alignment.registration import register
 from gsmerge.reading.held_out import read_held_out
-from gsmerge.reading.photos import colors
 from gsmerge.reading.read_scene import load_scene
-from gsmerge.results import distance, scores
+from gsmerge.results import scores
 from gsmerge.runtime import memory, work
 from gsmerge.scoring import fog
 from gsmerge.settings.budget import DEVICES
@@ -46,7 +44,7 @@ from gsmerge.settings.compact import RECIPES, method_names
 from gsmerge.settings.extend import ExtendOptions
 from gsmerge.settings.fit import FitOptions, Tuning
 from gsmerge.settings.stages import MAX_CHILDREN, SHARE, MatchOptions
-from gsmerge.special import curve, new_views, search
+from gsmerge.special import curve, new_views
 from gsmerge.special.blocks import compact_blocks as blocks
 from gsmerge.special.blocks import fit_seams as seams
 from gsmerge.special.blocks import partition
@@ -55,9 +53,8 @@ from gsmerge.stages import fit_pairs, sky
 ROOT = Path(__file__).parents[2]
 FIT, RATES, PAPER = FitOptions(), Tuning(), RECIPES["paper"]
 DECISIONS, LARGE, NETWORKS = (f"docs/internals/{name}.md" for name in ("decisions", "large-scenes", "networks"))
-COMPACT, CONVERT, EVALUATE, HOW_MANY, PHOTOS, MANY_SCENES, VIEW, AFTER_A_MODEL = (
-    f"docs/guide/{name}.md"
-    for name in ("compact", "convert", "evaluate", "how-many", "photos", "many-scenes", "view", "after-a-model")
+COMPACT, CONVERT, LOOK, MEASURE, MANY_SCENES, AFTER_A_MODEL = (
+    f"docs/guide/{name}.md" for name in ("compact", "convert", "look", "measure", "many-scenes", "after-a-model")
 )
 CONVENTIONS, EXPORTERS, FORMATS, REPORT = (
     f"docs/reference/{name}.md" for name in ("conventions", "exporters", "formats", "report")
@@ -128,20 +125,25 @@ CLAIMS: dict[str, tuple[str, ...]] = {
         f"--effort draft`: {plan.EFFORTS['draft'].steps} steps, no merging across views",
         f"--effort fast`: {plan.EFFORTS['fast'].steps} steps",
         f"--effort best`: {plan.EFFORTS['best'].steps} steps",
+        f"gsmerge keeps at most {SHARE.replace('%', ' %')} of a scene",
+        f"at most what the device draws fluidly: {', '.join(f'{count:,}' for count in DEVICES.values())}",
+        f"| `--k` | 1 to {MAX_CHILDREN} | this number for each superpixel; 1 by default, {plan.LONE_K} for a single",
+        f"measures quality as PSNR plus {curve.SSIM_DB:g} dB times SSIM",
+        f"The useful number of Gaussians is {percent(confirm_depths.MOST_PER_PIXEL)} of the input if other views"
+        f" confirm at least {percent(confirm_depths.SOUND_SHARE)} of the depth, and {percent(confirm_depths.FEWEST)} if"
+        f" they confirm {percent(confirm_depths.WRONG_SHARE)} or less",
+        f"With {word(LEAST_VIEWS)} photos or more, both kinds of `--quality` leave out some views",
         f"The estimate of the gain needs at least {word(LEAST_VIEWS)} photos, a result with at most"
         f" {percent(new_views.MOST_SHARE)} as many Gaussians as pixels",
-        f"the depth of {confirm_depths.CONFIRM_PIXELS:,} pixels of each view is compared with its nearest views, up to"
-        f" {confirm_depths.CONFIRM_NEIGHBORS} of them",
-        f"If the nearest views confirm clearly less than {part(confirm_depths.POOR_SHARE)} of the compared depths",
-        f"shows its photos more than {metrics.MAX_LOSS:g} dB worse than the input",
-        f"and less than {distance.WRONG_DB:g} dB of PSNR",
+        f"but at least {SHARE.replace('%', ' %')}, that keep the input's quality",
         f"if it shows the photos at most {plan.FIDELITY_LOSS:g} dB worse than the input does",
         f"at least {plan.FIDELITY_PSNR:g} dB against the input's",
-        f"moved by up to {cameras_off.MAX_PX:g} pixels, in small pictures by up to {percent(cameras_off.MAX_SHARE)}",
-        f"If the views miss {percent(draw_outside.LEAST_OUTSIDE)} of the Gaussians or more",
-        f"With more than {word(plan.USUAL_VIEWS)} views the fit takes more steps. Scenes of more than"
-        f" {million(plan.WHOLE_GAUSSIANS)} Gaussians are compacted in blocks of views, which takes less memory."
-        f" Scenes of more than {plan.WHOLE_VIEWS} views",
+        f"differs at random by more than {percent(exposure.DIFFERENT)}",
+        f"at least {photo_sizes.MIN_AUTO_SCALE:g} times as many pixels a side",
+        f"wider than a {part(holes.LARGE_SIDE)} of the picture",
+        f"cover at least {percent(holes.LARGE_AREA)} of it",
+        f"A white pixel counts as {word(int(types.PROTECTED))}",
+        f"Scenes of more than {million(plan.WHOLE_GAUSSIANS)} Gaussians",
         f"{part(1 / scores.INPUT_EVERY)} of the input's pixels and {part(1 / scores.RESULT_EVERY)} of the result's in"
         f" {word(views.REPORT_VIEWS)} photos (in drafts: {word(plan.EFFORTS['draft'].report_views)})",
     ),
@@ -150,7 +152,7 @@ CLAIMS: dict[str, tuple[str, ...]] = {
         f"{word(int(sky.FAR_RATIO))} times as far away as the rest",
         f"below 1/{1 / FIT.min_contribution:g} in every picture",
     ),
-    EVALUATE: (
+    MEASURE: (
         f"outside the views start from {word(fog.VIEWS)} input views",
         f"have at most {fog.FOG_PIXELS} pixels on the longer side",
         f"the input's opacity is below {fog.FOG_EMPTY:g} in the whole square of {fog.EROSION_PIXELS} x"
@@ -160,33 +162,10 @@ CLAIMS: dict[str, tuple[str, ...]] = {
         " result",
         f"A long thin Gaussian is at least {word(int(fog.RATIOS[0]))} times as long as its second axis",
         f"it is longer than {percent(fog.LONG)} of the picture's width",
-        f"A fit has up to {outside.PLACES} outside cameras, or as many as photos if there are more photos",
-        f"The fit's outside cameras step back by {outside.STEP_BACK_LOW[0]:g} d to {outside.STEP_BACK_HIGH[0]:g} d",
         f"Far fog above {fit_report.HAZE:g} and worst veils above {fog.VEILED:g} are plain to see",
     ),
-    HOW_MANY: (
-        f"gsmerge keeps at most {SHARE.replace('%', ' %')} of a scene",
-        f"at most what the device draws fluidly: {', '.join(f'{count:,}' for count in DEVICES.values())}",
-        f"| `--k` | 1 to {MAX_CHILDREN} | this number for each superpixel; 1 by default, {plan.LONE_K} for a single",
-        f"measures quality as PSNR plus {curve.SSIM_DB:g} dB times SSIM",
-        f"The useful number of Gaussians is {percent(confirm_depths.MOST_PER_PIXEL)} of the input if other views"
-        f" confirm at least {percent(confirm_depths.SOUND_SHARE)} of the depth, and {percent(confirm_depths.FEWEST)} if"
-        f" they confirm {percent(confirm_depths.WRONG_SHARE)} or less",
-        f"tries up to {word(search.MAX_LEFT_OUT_BUILDS)} numbers of Gaussians, or {word(search.MAX_BUILDS)}"
-        " where no photo is left out",
-        f"With {word(LEAST_VIEWS)} photos or more, both kinds of `--quality` leave out some views",
-    ),
-    PHOTOS: (
-        f"differs by {colors.EXPOSURE_STEP:g} of the range, averaged over"
-        f" {len(compare.MEAN_WINDOW)} x {len(compare.MEAN_WINDOW)} pixels",
-        f"at least {photo_sizes.MIN_AUTO_SCALE:g} times as many pixels a side",
-        f"wider than a {part(holes.LARGE_SIDE)} of the picture",
-        f"cover at least {percent(holes.LARGE_AREA)} of it",
-        f"exposures differ by more than {percent(exposure.DIFFERENT)} at random",
-        f"A white pixel counts as {word(int(types.PROTECTED))}",
-    ),
     MANY_SCENES: (f"the photos of at most {ExtendOptions().max_views} views",),
-    VIEW: (
+    LOOK: (
         f"more than {splats.MAX_GAUSSIANS:,} Gaussians",
         f"Of more than {data.MAX_SHOWN_VIEWS} views",
         f"or {' x '.join(map(str, drawings.PLACED_SIZE))} without cameras",
@@ -216,6 +195,7 @@ CLAIMS: dict[str, tuple[str, ...]] = {
     REPORT: (
         f"of up to {views.MAX_SCORED_VIEWS} views with `--quality`",
         f"null if it covers {percent(photos.WHOLE_SHARE)} or more",
+        f"more than {metrics.MAX_LOSS:g} dB worse than the input does".replace(" 0.", " ."),
         f"less than {metrics.POOR_PSNR:g} dB from its input",
         f"(at most {metrics.MAX_PSNR:g}, for equal pictures)",
         f"`psnr_kept` ({plan.FIDELITY_PSNR:g}) or `loss_kept` ({plan.FIDELITY_LOSS:g})",
@@ -255,10 +235,6 @@ TABLES: dict[str, dict[str, dict[str, Any]]] = {
     COMPACT: {
         "defaults": {}, "`--effort draft`": {"effort": "draft"}, "`--effort fast`": {"effort": "fast"},
         "`--effort best`": {"effort": "best"}, "`--fit none`": {"fit": "none"},
-    },
-    HOW_MANY: {
-        "`--set superpixels=1%`": {"superpixels": "1%"}, "`--budget 2%`": {"budget": "2%"}, "the defaults": {},
-        "`--k 2`": {"k": 2}, "`--budget auto`": {"budget": "auto"}, "`--k 4`": {"k": 4},
     },
     "docs/internals/adding.md": {
         f"`{name}`": {"method": name} | ({} if name.startswith("unmerged") else {"budget": "4.4%"})

@@ -90,7 +90,7 @@ def test_generated_pages_are_up_to_date() -> None:
 
 def test_formats_are_those_of_the_tables() -> None:
     """The guide names formats that there are, and leads to the reference, which has all of them."""
-    page = read("docs/guide/formats.md")
+    page = read("docs/guide/convert.md")
     cells = next(line for line in page.splitlines() if line.startswith("| Gaussians")).split("|")[2:4]
     known = [{row.ending for row in FORMATS if row.read}, {row.ending for row in FORMATS}]
     for cell, endings in zip(cells, known, strict=True):
