@@ -65,9 +65,7 @@ def measure(folder: Path, cache: Path, settings: Mapping[str, Any]) -> dict[str,
     record |= {"gain": mean.psnr - before.mean("target")[1].psnr, "own": report.psnr_after - report.psnr_before}
     record |= asdict(after.fog[ALL]) if after.fog else {}
     record |= report.choices.get("agreement", {})
-    return record | (
-        {} if report.new_views is None else dict(zip(("low", "high"), report.new_views.bounds, strict=True))
-    )
+    return record | ({} if report.new_views is None else {"low": report.new_views.low, "high": report.new_views.high})
 
 
 def seeds_table(runs: Mapping[str, Sequence[Record]]) -> str:

@@ -61,11 +61,6 @@ class NewViews(ExpectedScores):
 
     views: int  # Number of left-out photos on which the trial measured
 
-    @property
-    def gain(self) -> float:
-        """Gain of PSNR (dB) of a new view."""
-        return self.after - self.before
-
     def to_dict(self) -> dict[str, float]:
         """Return the numbers, rounded for a report, by name."""
         return {name: round(value, 4) for name, value in asdict(self).items()}

@@ -47,7 +47,7 @@ class Side:
     covered: Quality  # mean over the covered pixels of these views
     seconds: float  # time to draw a view on this machine, with all threads
     antialiased: bool  # how its file says that it is drawn, see :func:`gsmerge.render`
-    new_gain: tuple[float, float] | None = None  # bounds of the expected gain of new views, dB; None: not known
+    new_gain: float | None = None  # expected gain of new views, dB; None if it is not known
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,7 @@ def collect_page_data(
     held_out: Views | None = None,
     *,
     cameras: Mapping[str, Cameras] | None = None,
-    new_gains: Mapping[str, tuple[float, float]] | None = None,
+    new_gains: Mapping[str, float] | None = None,
     light: bool = False,
     progress: Progress = lambda *_: None,
 ) -> ViewData:
@@ -126,9 +126,8 @@ def collect_page_data(
 
     ``results`` are Gaussians by name in the scene's world, and may be empty. ``file_bytes`` are the file sizes of the
     scene and of the results. Stills and scores use ``cameras`` (see :func:`gsmerge.evaluate`); 3D uses the scene's
-    cameras. ``new_gains`` says, by result, how much better new views are expected to be: a lower and an upper bound in
-    dB. For a result that is worse than the scene, no gain is shown. If ``light``, the scene itself is shown in stills
-    only.
+    cameras. ``new_gains`` says, by result, how many dB better new views are expected to be. For a result that is worse
+    than the scene, no gain is shown. If ``light``, the scene itself is shown in stills only.
     """
     stills: Stills = {}
     cut_out = set[tuple[str, int]]()  # split and number of the views in large parts of which the scene shows nothing

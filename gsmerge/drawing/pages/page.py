@@ -113,24 +113,16 @@ def headline(data: ViewData, side_id: int = 1) -> str:
     share = after.num_gaussians / max(before.num_gaussians, 1)
     share_text = f"{human_share(share, 1 if share >= 0.01 else 2)} of the Gaussians"
     if after.new_gain is not None and not data.held_out:
-        return f"{share_text}, new views expected {describe_gain(*after.new_gain)}"
+        return f"{share_text}, new views about {describe_gain(after.new_gain)}"
     if new is None or old is None or not np.isfinite(new):
         return share_text
     if not np.isfinite(old):  # the input itself is the reference
         return f"{share_text}, {new:.1f} dB from the input's own renders"
     target = "photos that were not used" if data.held_out else "its own photos" if reference == PHOTOS else reference
-    return f"{share_text}, {_closer_or_farther(new - old)} {'to' if new >= old else 'from'} {target}"
+    return f"{share_text}, {describe_gain(new - old)} {'to' if new >= old else 'from'} {target}"
 
 
-def describe_gain(low: float, high: float) -> str:
-    """Describe the bounds of a gain (dB) in words."""
-    if low < 0 < high:
-        return f"{-low:.1f} dB farther to {high:.1f} dB closer"
-    smaller, larger = sorted((low, high), key=abs)
-    return f"{abs(smaller):.1f} to {_closer_or_farther(larger)}"
-
-
-def _closer_or_farther(gain: float) -> str:
+def describe_gain(gain: float) -> str:
     """Return a gain (dB) in words, such as "1.2 dB closer"."""
     return f"{abs(gain):.1f} dB {'closer' if gain >= 0 else 'farther'}"
 
@@ -188,7 +180,7 @@ def list_figures(data: ViewData, side_id: int) -> list[Figure]:
         Figure("File", human_bytes(before.file_bytes), human_bytes(after.file_bytes), ""),
     ]
     views, own = reference_words(data)
-    is_expected = not data.held_out and any(side.new_gain for side in data.sides)
+    is_expected = not data.held_out and any(side.new_gain is not None for side in data.sides)
     names = ("psnr",) if is_expected else ("psnr", "ssim")  # the expected gain takes the room of the SSIM
     qualities = [(f"{name.upper()}, {views}", name, before.mean, after.mean) for name in names]
     if data.lacks_pixels:
@@ -204,8 +196,8 @@ def list_figures(data: ViewData, side_id: int) -> list[Figure]:
             scores.append(Figure(label, _format_number(old, digits), _format_number(new, digits) + unit, mark))
     if is_expected:
         gain = after.new_gain
-        words = MISSING if gain is None else "{:+.1f} to {:+.1f} dB".format(*gain)
-        figures.append(Figure("New views, expected", "", words, "up" if gain is not None and gain[0] > 0 else ""))
+        words = MISSING if gain is None else f"about {gain:+.1f} dB"
+        figures.append(Figure("New views", "", words, "up" if gain is not None and gain > 0 else ""))
     return figures + (scores if data.scored else [])
 
 

@@ -68,7 +68,7 @@ def make_page(gaussians: Gaussians, cameras: Cameras, title: str, comments: Sequ
         "site.html", policy=SITE_POLICY, title=title, count=len(gaussians), names=NAMES,
         poster=data_uri(poster, "image/webp"), licences=data_uri(licences, "text/plain"),
         inside={NAMES[name]: base64_text(content) for name, content in files.items()},
-        gain=None if expected is None else describe_gain(*expected.bounds),
+        gain=None if expected is None else describe_gain(expected.gain),
         download=f"{title}.sog",
         json_data={
             "names": NAMES, "free": is_free, "start": views.index(start),

@@ -105,7 +105,7 @@ def view(
     loaded: dict[str, Any] = {**named, **files}
     gaussians = {name: own_gaussians(result) for name, result in loaded.items()}
     gains = file_gains(files) | {
-        name: expected.bounds
+        name: expected.gain
         for name, result in named.items()
         if (expected := getattr(getattr(result, "report", None), "new_views", None)) is not None
     }
@@ -127,10 +127,10 @@ def view(
     return Page(view_page(data).decode(), headline(data))
 
 
-def file_gains(files: Mapping[str, GaussianFile]) -> dict[str, tuple[float, float]]:
-    """Return the bounds of the expected gain of new views, in dB, by the name of each result whose file states them."""
+def file_gains(files: Mapping[str, GaussianFile]) -> dict[str, float]:
+    """Return the expected gain of new views, in dB, by the name of each result whose file states them."""
     known = {name: read_expected_scores(file.info.comments) for name, file in files.items()}
-    return {name: scores.bounds for name, scores in known.items() if scores}
+    return {name: scores.gain for name, scores in known.items() if scores}
 
 
 def _num_bytes(value: Any) -> int:

@@ -109,9 +109,9 @@ class ExpectedScores:
     high: float
 
     @property
-    def bounds(self) -> tuple[float, float]:
-        """Lower and upper bound of the expected gain in PSNR, dB."""
-        return self.low, self.high
+    def gain(self) -> float:
+        """Expected gain of PSNR (dB) of a new view."""
+        return self.after - self.before
 
 
 def result_comments(scores: ExpectedScores | None, kept: Sequence[str] = ()) -> list[str]:

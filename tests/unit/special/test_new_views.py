@@ -9,7 +9,6 @@ import pytest
 import scenes
 
 from gsmerge import Gaussians, Scene, compact, render
-from gsmerge.drawing.pages.page import describe_gain
 from gsmerge.geometry.views import subset
 from gsmerge.io.formats.rows import ExpectedScores, copied_comments, new_views_comment, read_expected_scores
 from gsmerge.prepare.prepare_scene import LEAST_VIEWS, prepare
@@ -164,15 +163,3 @@ def test_expected_scores_are_read_back_from_a_comment(scores: tuple[float, ...])
 def test_comments_of_another_form_have_no_expected_scores(comment: object) -> None:
     assert read_expected_scores([comment]) is None
     assert read_expected_scores([]) is None
-
-
-@pytest.mark.parametrize(
-    ("bounds", "words"),
-    [
-        ((2.0, 4.5), "2.0 to 4.5 dB closer"),
-        ((-0.5, 2.0), "0.5 dB farther to 2.0 dB closer"),
-        ((-3.0, -0.5), "0.5 to 3.0 dB farther"),
-    ],
-)
-def test_a_range_of_gains_is_described_in_words(bounds: tuple[float, float], words: str) -> None:
-    assert describe_gain(*bounds) == words

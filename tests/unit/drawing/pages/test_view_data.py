@@ -70,8 +70,8 @@ def actual() -> ViewData:
 def test_a_result_that_is_worse_has_no_expected_gain(small: Scene) -> None:
     """It may be of another scene; held-out photos say it themselves."""
     results = {"other": small.gaussians[:10], "same": small.gaussians}
-    made = collect_page_data("room", small, results, (300, 10, 300), new_gains=dict.fromkeys(results, (6.5, 9.0)))
-    assert [side.new_gain for side in made.sides] == [None, None, (6.5, 9.0)]
+    made = collect_page_data("room", small, results, (300, 10, 300), new_gains=dict.fromkeys(results, 7.8))
+    assert [side.new_gain for side in made.sides] == [None, None, 7.8]
     assert noted(made.notes, "other", "worse than room")
     assert "expected" not in headline(made)
 
