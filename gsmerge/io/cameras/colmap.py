@@ -106,7 +106,11 @@ def _make_view(path: Path, camera_id: int, model: str, size: tuple[int, int], pa
     """Make a view of a camera, without a name and a pose; raise SceneError if the camera model is not supported."""
     if model not in _PERSPECTIVE_MODELS | _FISHEYE_MODELS:
         problem = f"camera {camera_id}: expected a pinhole, a perspective or a fisheye camera, found {model}"
-        raise SceneError(path, problem, "undistort the images first")
+        is_panorama = model == "EQUIRECTANGULAR"
+        remedy = (
+            "cut cube faces from the panoramas, and give each a camera" if is_panorama else "undistort the images first"
+        )
+        raise SceneError(path, problem, remedy)
     num_intrinsics = 3 if model in _ONE_FOCAL else 4  # the rest are coefficients of the lens
     K = make_pinhole(params[0], *params[:3]) if model in _ONE_FOCAL else make_pinhole(*params[:4])
     distortion = params[num_intrinsics : _NUM_PARAMS[model]]

@@ -84,6 +84,7 @@ PROGRAMS = (
     Foreign("*_par.txt *.conf", "Middlebury or Matterport", _WRITE_POSES, r"^\s*\d+\s|^dataset"),
     Foreign("*.out *.mve/meta.ini", "MVE", _WRITE_POSES, "drews|MVE view"),
     Foreign("*.csv", "EuRoC's body", _WRITE_POSES, "#(timestamp|time)"),
+    Foreign("odometry.csv", "Stray Scanner", _WRITE_POSES, "timestamp"),
     Foreign("camera/*.npz poses.npz", "CUT3R or Spann3R", _WRITE_POSES, "pose"),
     Foreign("disps.npy tstamps.npy reconstruction.pth", "DROID-SLAM", _WRITE_POSES),
     Foreign("*.json", "a path of nerfstudio's viewer, or ns-export", "name the transforms.json of the capture",

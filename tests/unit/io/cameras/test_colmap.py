@@ -72,6 +72,13 @@ def test_unknown_colmap_models_are_refused(
         read_cameras(tmp_path / name)
 
 
+def test_cameras_of_panoramas_in_a_colmap_model_are_refused_with_their_own_remedy(tmp_path: Path) -> None:
+    (tmp_path / "cameras.txt").write_text("1 EQUIRECTANGULAR 2000 1000\n")
+    (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a.jpg\n\n")
+    with refuses(SceneError, "cameras.txt: camera 1", "cube faces"):
+        read_cameras(tmp_path)
+
+
 def test_a_colmap_model_that_shrinks_while_it_is_read_is_refused(
     tmp_path: Path, tiny: Tiny, monkeypatch: pytest.MonkeyPatch
 ) -> None:

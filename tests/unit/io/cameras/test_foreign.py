@@ -57,6 +57,7 @@ FILES = [
     ("frame_00000.json", '{"cameraPoseARFrame": [1, 0', "3D Scanner App", "transforms.json"),
     ("lowres_wide.traj", "1.0 0 0 0 0 0 0\n", "ARKitScenes", "transforms.json"),
     ("frame_annotations.jgz", "\x1f\x8b", "CO3D", "transforms.json"),
+    ("odometry.csv", "timestamp, frame, x, y, z, qx, qy, qz, qw", "Stray Scanner", "transforms.json"),
     ("mav0/state/data.csv", "#timestamp, p_RS_R_x [m]", "EuRoC", "transforms.json"),
     ("disps.npy", "\x93NUMPY", "DROID-SLAM", "views.npz"),
     ("camera/000000.npz", "PK\3\4 pose.npy", "CUT3R", "views.npz"),
