@@ -15,8 +15,9 @@ SETTINGS = (FileOptions, CleanOptions, PlacementOptions)
 
 def convert(
     paths: Annotated[list[Path], opt.argument("IN... OUT", "Files or folders of Gaussians, such as a .ply, .spz or "
-        ".sog. Several files in one coordinate frame are joined. The last path is the output, and its name sets the "
-        "format, also .html (a page to send), lod-meta.json, or a folder.")],
+        ".sog. Several files in one coordinate frame are joined. Without -o the last path is the output. Its name sets "
+        "the format, also .html (a page to send), lod-meta.json, or a folder.")],
+    output: Annotated[Path | None, opt.output("The output, instead of the last path.")] = None,
     cameras: Annotated[opt.Parsed | None, opt.option(opt.INPUT, "PATH", "Cameras in the frame of the first file; they "
         "are transformed as well. Default: the cameras inside a result or beside it; none: without.",
         read=opt.path_or_none)] = None,
@@ -34,7 +35,7 @@ def convert(
     given = opt.read_settings(
         SETTINGS, set, up=up, scale=scale, rotate=rotate, translate=translate, sh_degree=sh_degree, crop=crop, drop=drop
     )
-    *inputs, output = paths
+    *inputs, output = paths if output is None else (*paths, output)
     if not inputs:
         remedy = f"name the output last, as in gsmerge convert {output} x.spz"
         raise UsageError(f"expected files to read and one to write, got only {output}; {remedy}")

@@ -250,6 +250,14 @@ def test_the_command(small_scene: Path, tmp_path: Path, result: Path, run: Run) 
     assert run("convert", tmp_path / "none.ply", tmp_path / "d.ply").code == 3
 
 
+def test_output_by_its_option_is_the_output_as_the_last_path(result: Path, tmp_path: Path, run: Run) -> None:
+    by_path, by_option = tmp_path / "a.spz", tmp_path / "b.spz"
+    run("convert", result, by_path, code=0)
+    run("convert", result, "-o", by_option, code=0)
+    assert by_option.read_bytes() == by_path.read_bytes()
+    assert run("convert", "-o", by_option).code == 2
+
+
 def test_full_columns_are_the_62_of_a_ply(small_scene: Path, tmp_path: Path, run: Run) -> None:
     """Unity's importer wants 62."""
     quick = ("--effort", "draft", "--fit", "none", "--budget", "200", "-q", "--set", "columns=full")

@@ -39,7 +39,6 @@ USAGE = {
     "extend a.gsm room --seed 3": "*--seed*--set seed=VALUE",
     "compact room -overwrite": "-overwrite*two dashes*--overwrite",
     "render room -output=a.png": "-output=a.png*two dashes*--output=a.png",
-    "convert room -o y.spz": "*-o",
     "--quiet room": "*--quiet",
     "compact ''": "SCENE*empty",
     "convert a.ply ''": "IN... OUT*empty",
