@@ -99,6 +99,7 @@ def of_metashape() -> dict[str, Damage]:
         "3,000 names in a namespace of 1 MB": allow(add_element(f"<x xmlns:a='{address}'>{names}</x>"), slow=True),
         "400,000 elements in one another": allow(add_element("<a>" * 400_000 + "</a>" * 400_000), slow=True),
         "a component's number with a quote": allow(swap('<camera id="0"', '<camera component_id="a\'b" id="0"')),
+        "another encoding than it has": allow(swap("UTF-8", "utf-7")),
         "a declared entity": allow(swap("<document>", "<!DOCTYPE x [<!ENTITY a 'aaaa'>]><document>")),
     }
 

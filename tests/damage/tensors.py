@@ -118,6 +118,7 @@ def set_metadata(metadata: object) -> Change:
 def of_any() -> dict[str, Damage]:
     """Return what is wrong with any file."""
     metadata = ([1, "a"], "text", 7, True, {"gsmerge": 1}, {"gsmerge": ["a"]}, {"gsmerge": {"a": "b"}})
+    values = (5, [1], None, "\0", "\ud800", "[" * 990 + "]" * 990)
     return {
         "a byte more at the end": refuse(edit_bytes(lambda data: data + b"x")),
         "the last byte cut off": refuse(edit_bytes(lambda data: data[:-1])),
@@ -130,6 +131,10 @@ def of_any() -> dict[str, Damage]:
         "a header that is a list": refuse(write_header("[]")),
         "a header of 100,000 open brackets": refuse(write_header("[" * 100_000)),
         **{f"metadata as {json.dumps(value)}": refuse(set_metadata(value)) for value in metadata},
+        **{
+            f"a header of {json.dumps(value)[:9]} in the metadata": refuse(set_metadata({gsm.HEADER: value}))
+            for value in values
+        },
     }
 
 

@@ -74,3 +74,11 @@ def test_variable_sets_the_number_of_threads(smallest_copy: Path, monkeypatch: p
         assert available_threads() == count == 3
     monkeypatch.setenv("GSMERGE_THREADS", "0")
     assert_refused(run("inspect", smallest_copy), 2, "GSMERGE_THREADS", "'0'")
+
+
+@pytest.mark.parametrize("count", ["1025", "9" * 23, "-1", "two"])
+def test_impossible_numbers_of_threads_in_the_variable_are_refused(
+    count: str, smallest_scene: Path, monkeypatch: pytest.MonkeyPatch, run: Run
+) -> None:
+    monkeypatch.setenv("GSMERGE_THREADS", count)
+    assert_refused(run("inspect", smallest_scene), 2, "GSMERGE_THREADS", "1 to 1024", f"'{count}'")

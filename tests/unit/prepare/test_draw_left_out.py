@@ -8,8 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scenes
+from PIL import Image
+from saved_cameras import write_transforms
 
-from gsmerge import Compactor, Gaussians, Scene, compact, render
+from gsmerge import Compactor, Gaussians, Scene, compact, read_scene, render, write_ply
 from gsmerge.prepare.prepare_scene import prepare
 from gsmerge.raster.metrics import decibels
 
@@ -131,3 +133,51 @@ def test_large_gaussians_do_not_eat_the_edge_of_an_object(ball: Scene) -> None:
     assert prepared.scene.masks is not None
     solid = alphas[..., 0] > 0.95
     assert prepared.scene.masks[solid].mean() > 0.9
+
+
+@pytest.mark.parametrize("part", ["an object", "all but the sky"])
+@pytest.mark.parametrize("has_pixels", [True, False])
+def test_what_was_cut_away_stays_empty_beside_photos_of_the_whole(part: str, has_pixels: bool, room: Scene) -> None:
+    if part == "an object":
+        near = np.linalg.norm(room.gaussians.means - np.array([0.2, 0.1, 2.6]), axis=1) < 0.55
+    else:
+        near = np.arange(len(room.gaussians)) % (HEIGHT * WIDTH) >= HEIGHT // 3 * WIDTH
+    cut = scenes.shown_in(room, near.reshape(room.images.shape[:3]))
+    result = compact(cut if has_pixels else replace(cut, pixels=None), **FIT).gaussians
+    empty = render(cut.gaussians, cut.cameras).alphas[..., 0] < 0.02
+    assert empty.mean() > 0.2
+    assert render(result, cut.cameras).alphas[..., 0][empty].mean() < 0.05
+    assert over_both(result, cut) > 27.5
+
+
+@pytest.mark.parametrize("is_opaque", [True, False], ids=["masks", "transparency"])
+def test_cut_out_photos_of_an_object_leave_its_surroundings_empty(is_opaque: bool, ball: Scene, tmp_path: Path) -> None:
+    """Whether soft masks lie beside them, or the photos are transparent there and white below that."""
+    alphas = render(ball.gaussians, ball.cameras).alphas
+    colors = ball.images + 1 - alphas
+    for view, name in enumerate(ball.names):
+        levels = (255 * np.concatenate([colors[view], alphas[view]], 2).clip(0, 1)).round().astype(np.uint8)
+        (tmp_path / "images").mkdir(exist_ok=True)
+        Image.fromarray(levels[..., :3] if is_opaque else levels).save(tmp_path / "images" / name)
+        if is_opaque:
+            (tmp_path / "masks").mkdir(exist_ok=True)
+            Image.fromarray(levels[..., 3]).save(tmp_path / "masks" / name)
+    write_ply(tmp_path / "scene.ply", ball.gaussians)
+    write_transforms(tmp_path / "transforms.json", ball.cameras, [f"images/{name}" for name in ball.names])
+    result = compact(read_scene(tmp_path), **FIT).gaussians
+
+    assert render(result, ball.cameras).alphas[alphas < 0.02].mean() < 0.02
+    assert over_both(result, ball) > 36.5
+
+
+def test_faint_pixels_of_a_removed_background_stay_empty(ball: Scene, room: Scene) -> None:
+    """A model gives every pixel a row, those of the white background next to no opacity."""
+    alphas = render(ball.gaussians, ball.cameras).alphas
+    rows = alphas.reshape(-1) < 0.5
+    opacities, sh0 = room.gaussians.opacities.copy(), room.gaussians.sh0.copy()
+    opacities[rows], sh0[rows] = 0.01, 1.77
+    white = replace(room.gaussians, opacities=opacities, sh0=sh0)
+    photos = np.where(alphas > 0.5, room.images, np.float32(1))
+    result = compact(replace(room, gaussians=white, images=photos), **FIT).gaussians
+    assert render(result, room.cameras).alphas[alphas < 0.02].mean() < 0.03
+    assert over_both(result, ball) > over_both(white, ball)

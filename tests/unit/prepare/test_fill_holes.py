@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -215,3 +216,27 @@ def test_depth_maps_of_the_model_fill_what_it_dropped(tmp_path: Path) -> None:
     )
     assert np.median(right) < 0.01 < np.median(guessed)
     np.testing.assert_array_equal(wrong, guessed)
+
+
+LOST: dict[str, tuple[Callable[[np.ndarray], None], float]] = {  # changes of rows [v,h,w], and dB that they may cost
+    "some placeholders": (lambda rows: rows.reshape(-1)[::97].fill(0), 0.3),
+    "a strip times a mask": (lambda rows: rows[:, :, :12].fill(0), 0.3),
+    "a view of NaN": (lambda rows: [rows[name][2].fill(np.nan) for name in rows.dtype.names], 0.8),
+}
+
+
+@pytest.mark.parametrize("kind", LOST)
+def test_rows_that_show_nothing_cost_little(tmp_path: Path, kind: str) -> None:
+    """They are set aside, and what the photos show in their place is there."""
+    tiny, (change, cost) = smooth_scene(96, 72), LOST[kind]
+    rows = export_rows(tiny)
+    sound = load_scene(save_export(tmp_path / "sound", tiny, rows)).scene
+    change(rows.reshape(3, 72, 96))
+    if kind != "some placeholders":
+        rows["rot_0"][rows["opacity"] == 0] = 1
+    loaded = load_scene(save_export(tmp_path / "lost", tiny, rows))
+    assert loaded.scene.has_own_pixels
+    assert noted(loaded.notes, f"{np.count_nonzero(~(np.abs(rows['opacity']) > 0)):,}")
+    settings = {"superpixels": "5%", "fit_steps": 60, "poses": "fixed", "new_views": False}
+    psnrs = [scenes.psnr_of(compact(one, **settings).gaussians, sound) for one in (loaded.scene, sound)]
+    assert psnrs[0] > psnrs[1] - cost

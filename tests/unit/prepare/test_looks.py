@@ -14,6 +14,7 @@ from messages import noted
 from gsmerge import CompactResult, Scene, compact, render
 from gsmerge.geometry.transforms import rgb_to_sh0, sh0_to_rgb
 from gsmerge.prepare.compare_photos import _note_hidden, have_other_tones
+from gsmerge.prepare.prepare_scene import prepare
 from gsmerge.prepare.row_colors import PHOTOS, ROW_COLORS
 from gsmerge.runtime.record import record_run
 from gsmerge.types import PicturedScene
@@ -112,3 +113,18 @@ def test_the_tone_of_gaussians_does_not_depend_on_what_hides_them(change: Callab
     assert have_other_tones(near, range(4)) == (change is not None)
     nothing = replace(near, gaussians=near.gaussians[:0])
     assert have_other_tones(nothing, range(4))  # which says nothing against what drawings say
+
+
+@pytest.mark.parametrize(("opacity", "size"), [(0.5, 1.0), (1.0, 0.35)], ids=["thin", "sparse"])
+def test_photos_stay_beside_gaussians_that_draw_them_dark(opacity: float, size: float, room: Scene) -> None:
+    """Light passes through thin Gaussians and between sparse ones, whose colours are those of the photos."""
+    scene = unaligned_scenes.voxels(room, 0.06)
+    g = scene.gaussians
+    dark = replace(scene, gaussians=replace(g, opacities=opacity * g.opacities, scales=np.float32(size) * g.scales))
+    assert render(dark.gaussians, dark.cameras).images.mean() < 0.8 * room.images.mean()
+    with record_run() as record:
+        prepared = prepare(dark)
+    assert prepared.reference.name == PHOTOS
+    assert prepared.reference.score_views == (0, 1, 2, 3)
+    assert not noted(record.notes, "tone")
+    assert np.abs(prepared.scene.images - room.images).mean() < 0.01

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import scenes
 
+from gsmerge import compact, render
+from gsmerge.geometry.transforms import rgb_to_sh0
 from gsmerge.kernels.elementary import cos, sin
 from gsmerge.prepare.place_cameras import add_views, place_inside, place_viewpoints
+from gsmerge.raster.metrics import psnr
 from gsmerge.runtime.record import record_run
-from gsmerge.types import NO_CAMERAS, Gaussians, make_scene
+from gsmerge.types import NO_CAMERAS, Cameras, Gaussians, make_scene
 
 PLACE = np.array([3.0, -2.0, 5.0])
 
@@ -61,3 +67,17 @@ def test_placing_cameras_inside_is_noted_once() -> None:
         assert len(add_views(make_scene(scene_around(), NO_CAMERAS))) == 24
     assert len(record.notes) == 1
     assert "around a viewer" in record.notes[0]
+
+
+@pytest.mark.slow
+def test_a_result_looks_from_the_inside_of_a_world_as_the_world_does() -> None:
+    world = scene_around(count=40_000)
+    colors = scenes.waves(3, 1.0)((world.means - PLACE) / np.linalg.norm(world.means - PLACE, axis=1, keepdims=True))
+    world = replace(world, sh0=rgb_to_sh0(colors[:, None].astype(np.float32)))
+    result = compact(make_scene(world, NO_CAMERAS), budget="15%").gaussians
+    eye, angles = PLACE + np.array([0.1, 0.05, -0.1]), np.arange(6.0)
+    sights = PLACE + np.stack([cos(angles), 0.3 * sin(2 * angles), sin(angles)], 1)
+    viewmats = np.stack([scenes.look_at(eye, sight) for sight in sights])
+    cameras = Cameras(viewmats, scenes.intrinsics(6, 64, 64), 64, 64)
+    psnrs = [psnr(*pair) for pair in zip(*(render(each, cameras).images for each in (world, result)), strict=True)]
+    assert min(psnrs) > 46

@@ -6,7 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scenes
 
+from gsmerge import compact
 from gsmerge.geometry.transforms import is_inside, project, rgb_to_sh0
 from gsmerge.raster import render
 from gsmerge.stages.fill import MOST_FILLED_VIEWS, fill_between, lies_between
@@ -113,3 +115,11 @@ def test_what_each_view_shows_as_empty_stays_empty() -> None:
 @pytest.mark.parametrize("count", [1, MOST_FILLED_VIEWS + 1])
 def test_scenes_of_one_or_very_many_views_are_not_filled(count: int) -> None:
     assert len(fill(*slit(*np.linspace(-0.6, 0.6, count)))) == 0
+
+
+def test_a_result_that_keeps_all_gaussians_is_filled_as_others_are() -> None:
+    scene = scenes.make_scene(scenes.room(), scenes.arc(3, 32, 24), noise=0.01)
+    usual, whole = (compact(scene, new_views=False, **more).report for more in ({}, {"min_contribution": 0.0}))
+    assert whole.options["min_contribution"] == 0 < usual.options["min_contribution"]
+    assert "fill" in usual.seconds
+    assert "fill" in whole.seconds

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 import struct
 from dataclasses import replace
@@ -11,10 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 import scenes
+from messages import refuses
 from slow_readers import drawn
 
 from gsmerge import Gaussians, Scene
-from gsmerge.errors import list_doubts
+from gsmerge.errors import SceneError, list_doubts
 from gsmerge.geometry.transforms import multiply_quats, project, quat_to_rotmat
 from gsmerge.io import read_gaussians, write_gaussians
 from gsmerge.io.cameras.viewer_cameras import order_views
@@ -253,3 +255,27 @@ def test_settings_of_a_user_beside_a_sog_stay(scene: Scene, tmp_path: Path) -> N
     settings.write_text("{}")
     write_scene(path, scene, overwrite=True)
     assert settings.read_text() == "{}"
+
+
+def test_many_small_parts_share_the_memory_of_one_file(tmp_path: Path) -> None:
+    """Each part, a gzip of zeros, is small enough by itself."""
+    part = gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", 3, 400_000, 0, 12, 0, 0) + bytes(400_000 * 20), 9)
+    part += bytes(-len(part) % 4)
+    splats = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    primitives = [
+        {"attributes": {}, "mode": 0,
+         "extensions": {NAME: splats | {"extensions": {f"{NAME}_compression_spz_2": {"bufferView": view}}}}}
+        for view in range(3)
+    ]  # fmt: skip
+    views = [{"buffer": 0, "byteOffset": view * len(part), "byteLength": len(part)} for view in range(3)]
+    document = {
+        "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": primitives}], "bufferViews": views, "buffers": [{"byteLength": 3 * len(part)}],
+        "extensionsUsed": [NAME],
+    }  # fmt: skip
+    write_document(tmp_path / "a.glb", document, 3 * part)
+    with refuses(SceneError, "a.glb", "64 MB", f"{(tmp_path / 'a.glb').stat().st_size:,} bytes"):
+        read_gaussians(tmp_path / "a.glb")
+    write_document(tmp_path / "b.glb", document | {"meshes": [{"primitives": primitives[:1]}]}, 3 * part)
+    with refuses(SceneError, "b.glb", "400,000 rows at the origin"):  # a part is read by itself
+        read_gaussians(tmp_path / "b.glb")
