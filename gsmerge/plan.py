@@ -63,7 +63,9 @@ BLOCK_VIEWS, WHOLE_VIEWS = 42, 168  # the two limits above as numbers of views, 
 USUAL_BUILDS, USUAL_BUILDS_OF_RENDERS = 3, 1
 # Work of the stages of a build, and of scoring the input, for each view, in steps of a fit
 STAGE_STEPS, INPUT_STEPS = 10.0, 3.0
-TRIAL_SHARE = 0.25  # cost of the trial that estimates new views, as a share of building the result
+# Cost of the trial that estimates new views, as a share of building the result; cost of building a coarser level of
+# detail, as a share of building the next finer level
+TRIAL_SHARE, LEVEL_SHARE = 0.25, 0.6
 LONE_K = 4  # K if all views have the same camera, because no other view adds Gaussians to a surface
 
 
@@ -564,5 +566,8 @@ def run_parts(prepared: Prepared, plan: Plan) -> list[RunPart]:
     build = RunPart("build", STAGE_STEPS * views, steps)
     count = usual_builds(has_target=plan.target_psnr is not None, rendered=prepared.reference.name == RENDERS)
     trial = RunPart("trial", TRIAL_SHARE * build.stages, TRIAL_SHARE * steps)
-    parts = [build] * (count + plan.levels - 1)
-    return [*parts, RunPart("input", INPUT_STEPS * views), *([trial] if plan.new_views else [])]
+    shares = [1.0] * count + [LEVEL_SHARE**level for level in range(1, plan.levels)]
+    return [
+        *(RunPart("build", share * build.stages, share * steps) for share in shares),
+        RunPart("input", INPUT_STEPS * views), *([trial] if plan.new_views else []),
+    ]  # fmt: skip

@@ -24,11 +24,13 @@ from gsmerge.plan import (
     EFFORTS,
     FIDELITY_LOSS,
     FIDELITY_PSNR,
+    LEVEL_SHARE,
     Plan,
     choose_networks,
     make_plan,
     plan_scene,
     resolve_budget,
+    run_parts,
     steps_for,
 )
 from gsmerge.prepare.confirm_depths import Agreement, confirm_depths
@@ -353,3 +355,13 @@ def test_limits_beyond_what_wrong_depth_bears_are_as_no_budget(budget: str) -> N
     assert noted(record.notes, "44,000", budget)
     asked = resolve_budget(size, options_of(budget="2%"), wrong)
     assert plan_scene(size, asked).limits.count == 20_000
+
+
+def test_coarser_levels_are_expected_to_take_less_time(scene: Scene) -> None:
+    """A share of the time of the next finer level each, before the input is scored."""
+    prepared = prepare(scene, options_of().prepare)
+    *builds, last = run_parts(prepared, plan_of(scene, levels=3, new_views=False))
+    assert [part.name for part in builds] == ["build"] * 3
+    assert last.name == "input"
+    works = [part.work / builds[0].work for part in builds]
+    assert works == pytest.approx([1, LEVEL_SHARE, LEVEL_SHARE**2])
