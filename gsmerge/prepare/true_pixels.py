@@ -52,7 +52,8 @@ def raise_sizes(scene: SceneT, *, placed: bool = False) -> SceneT:
 
     Gaussians that share a pixel may be smaller than it, because each shows a part of the pixel. They do not count as
     hidden, because otherwise sound scenes with few pixels would change. If the cameras were ``placed``, sizes are
-    compared with the distance to the nearest Gaussian instead of a pixel.
+    compared with the distance to the nearest Gaussian instead of a pixel. Without photos, nothing changes in a scene
+    that is drawn antialiased, because there the low-pass makes small Gaussians fainter instead of hiding their size.
     """
     g, cameras, by_distance = scene.gaussians, scene.cameras, placed and len(scene.gaussians) > 1
     homes = np.full(len(g), -1) if scene.pixels is None else scene.pixels.homes
@@ -60,7 +61,9 @@ def raise_sizes(scene: SceneT, *, placed: bool = False) -> SceneT:
     units = measure_pixel_sizes(g.means[::step], homes[::step], cameras)
     if by_distance:  # the Gaussians of a sample are farther apart than all Gaussians
         units = np.minimum(units, find_nearest(g.means[::step], 1)[1][:, 0] / math.sqrt(step))
-    if (g.scales[::step].max(1) < HIDDEN_SIZE * LOW_PASS * units).mean() < FEWEST_HIDDEN:
+    if (cameras.antialiased and scene.images is None) or (
+        g.scales[::step].max(1) < HIDDEN_SIZE * LOW_PASS * units
+    ).mean() < FEWEST_HIDDEN:
         return scene
     units = find_nearest(g.means, 1)[1][:, 0] if by_distance else measure_pixel_sizes(g.means, homes, cameras)
     sizes, seen = g.scales.max(1), (homes >= 0) | by_distance

@@ -15,6 +15,7 @@ from slow_readers import corners
 from gsmerge import EvaluateOptions, Gaussians, Scene, compact, evaluate, read_scene, render
 from gsmerge.io import kept_comments, read_gaussians, write_gaussians, write_ply
 from gsmerge.jobs.convert import ConvertOptions, convert_files
+from gsmerge.raster.metrics import psnr
 from gsmerge.results.outputs import name_outputs
 from gsmerge.settings.files import PlacementOptions
 
@@ -150,3 +151,12 @@ def test_files_of_different_marks_are_each_drawn_their_own_way(wall: Scene) -> N
     assert other < 60
     both = evaluate(scene, results, None, replace(options, antialiased=True), cameras=marked).results
     assert len({one.mean("context")[0].psnr for one in both}) == 1
+
+
+def test_a_result_looks_as_its_marked_input_where_viewers_heed_the_mark(wall: Scene) -> None:
+    """Small Gaussians beside cameras without photos."""
+    cameras = replace(wall.cameras, antialiased=True)
+    marked = Scene(wall.gaussians[::-1], cameras, None, None, wall.names)
+    result = compact(marked, budget="10%").gaussians
+    before, after = (render(each, cameras).images for each in (wall.gaussians, result))
+    assert psnr(before[0], after[0]) > 36.5
