@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from gsmerge.errors import UsageError
 from gsmerge.fit import photo_scale, start_share
+from gsmerge.frozen import dataclass, replace
 from gsmerge.geometry.views import REPORT_VIEWS, pick_views, scored_views
 from gsmerge.prepare.confirm_depths import FEWEST, Agreement
 from gsmerge.prepare.prepare_scene import Prepared

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
@@ -20,6 +19,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 import numpy as np
 
 from gsmerge.arrays import Array, ArrayFields, as_array, as_index, as_pictures, as_tensor, check_shape, concat_rows
+from gsmerge.frozen import dataclass, field, fields, replace
 from gsmerge.runtime.arguments import check_fields
 
 if TYPE_CHECKING:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gsmerge.cli.parameters import Reading, usage_errors
 from gsmerge.errors import SceneError, UsageError
+from gsmerge.frozen import dataclass, replace
 from gsmerge.settings.evaluate import NETS, EvaluateOptions
 
 if TYPE_CHECKING:

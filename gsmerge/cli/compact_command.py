@@ -4,7 +4,6 @@ import os
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Annotated, Any
@@ -15,6 +14,7 @@ from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import print_document, say, say_notes, separate_stdout, stage_progress, terminal_columns
 from gsmerge.cli.paths import check_outputs, input_files, output_file
 from gsmerge.errors import Doubt, TargetError, UsageError, split_notes
+from gsmerge.frozen import dataclass, replace
 from gsmerge.settings.compact import CHECKPOINTS, CompactOptions
 from gsmerge.settings.files import FileOptions
 from gsmerge.settings.reading import NONE

@@ -1,7 +1,6 @@
 """``gsmerge evaluate``: measure quality, bytes and render time of a scene and its compact versions."""
 
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -10,6 +9,7 @@ from gsmerge.cli.before_after import lpips_networks, read_before_after
 from gsmerge.cli.console import print_document, say_notes, stage_progress, terminal_columns
 from gsmerge.cli.paths import check_outputs, input_files, write_texts
 from gsmerge.errors import UsageError
+from gsmerge.frozen import dataclass
 from gsmerge.settings.evaluate import EvaluateOptions
 from gsmerge.settings.setting import Settings, setting
 

@@ -13,13 +13,13 @@ import shutil
 import textwrap
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
 from gsmerge.errors import UsageError
+from gsmerge.frozen import dataclass
 from gsmerge.runtime.plugins import LazyFunction
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.evaluate import NETS, EvaluateOptions

@@ -6,10 +6,10 @@ All cameras are in float64.
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, replace
 
 import numpy as np
 
+from gsmerge.frozen import dataclass, replace
 from gsmerge.geometry.transforms import (
     camera_centres,
     lower_median,

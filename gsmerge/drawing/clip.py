@@ -9,7 +9,6 @@ import sys
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from threading import Thread
@@ -20,6 +19,7 @@ from PIL import Image
 
 from gsmerge.drawing.preview import FACE, BytePicture, shorten_text
 from gsmerge.errors import SceneError
+from gsmerge.frozen import dataclass
 from gsmerge.io import atomic_output
 from gsmerge.io.image_names import CLIP_ENDS
 from gsmerge.kernels.elementary import sin

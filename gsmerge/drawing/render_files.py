@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +31,7 @@ from gsmerge.drawing.preview import (
     view_pictures,
 )
 from gsmerge.errors import SceneError, UsageError, name_notes
+from gsmerge.frozen import dataclass, replace
 from gsmerge.geometry.views import pick_views, subset
 from gsmerge.io import file_notes, read_cameras, read_gaussians, to_cameras
 from gsmerge.io.atomic import atomic_outputs, common_mode

@@ -9,12 +9,12 @@ also split along the edge after the fit.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
 from gsmerge.fit.fit_state import FitState, state_of
 from gsmerge.fit.growth import OFFSET, fade_halves
+from gsmerge.frozen import dataclass
 from gsmerge.geometry.pooling import principal_axes
 from gsmerge.geometry.transforms import camera_centres, camera_depths, covariances
 from gsmerge.kernels.elementary import exp, log

@@ -11,11 +11,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
+from gsmerge.frozen import dataclass, replace
 from gsmerge.geometry.transforms import depths_inside, is_inside, middle_depth, project, quantiles, step_outside
 from gsmerge.kernels.raster.project import TILE
 from gsmerge.raster import Splats, make_splats, tile_view

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from gsmerge.arrays import ArrayFields
 from gsmerge.fit.outside import Outside
+from gsmerge.frozen import dataclass, field
 from gsmerge.runtime.record import note, record_choices, report_progress
 from gsmerge.types import Cameras, Gaussians
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
 from gsmerge.fit.edges import Edges
 from gsmerge.fit.outside import Outside
 from gsmerge.fit.photo_sizes import HIDDEN_WEIGHT, reduced, training_weights
+from gsmerge.frozen import dataclass
 from gsmerge.kernels.elementary import power
 from gsmerge.raster.photos import WHOLE_PHOTO, Photos, Sample
 from gsmerge.settings.fit import LONG_STEPS, FitOptions, Tuning

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
 
 import numpy as np
 
 from gsmerge.fit.fit_state import FitState, start_state
 from gsmerge.fit.photo_sizes import holdout_psnr
 from gsmerge.fit.schedule import FitRun
+from gsmerge.frozen import dataclass, fields
 from gsmerge.geometry.transforms import project
 from gsmerge.raster import make_splats, tile_view
 from gsmerge.raster.composite import list_contributions, survey

@@ -8,10 +8,10 @@ two, so scaling to the frame and back changes no bit.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
 
 import numpy as np
 
+from gsmerge.frozen import dataclass, replace
 from gsmerge.geometry.transforms import camera_depths, lower_median, move_region, project
 from gsmerge.kernels.matrices import matmul
 from gsmerge.runtime.threads import parallel_map

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
 from gsmerge.arrays import to_float32
+from gsmerge.frozen import dataclass
 from gsmerge.geometry.transforms import camera_depths
 from gsmerge.kernels.elementary import exp, log
 from gsmerge.kernels.gaussians.pool import decompose, pool

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
 
 from gsmerge.arrays import Array
+from gsmerge.frozen import dataclass, replace
 from gsmerge.kernels.elementary import arctan2, cos, sin
 from gsmerge.kernels.gaussians.cross_view import make_tree, nearest_of_others
 from gsmerge.kernels.matrices import closest_rotation, invert, matmul, solve

@@ -21,13 +21,13 @@ import time
 import zlib
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
 from functools import cache, reduce
 from itertools import groupby, takewhile
 from operator import and_
 from pathlib import Path
 
 from gsmerge.errors import SceneError
+from gsmerge.frozen import dataclass, field
 from gsmerge.io.bounds import walk_files
 from gsmerge.types import StrPath
 

@@ -14,11 +14,11 @@ import stat
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TextIO
 
 from gsmerge.errors import OUT_OF_MEMORY, SceneError
+from gsmerge.frozen import dataclass
 from gsmerge.io.first_bytes import check_first_bytes
 from gsmerge.types import StrPath
 

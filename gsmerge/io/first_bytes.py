@@ -5,10 +5,10 @@ from __future__ import annotations
 import re
 import shlex
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 
 from gsmerge.errors import SceneError
+from gsmerge.frozen import dataclass
 
 _PACKED_SCENES = (".spz", ".splat", ".sog", ".npz", ".glb", ".gsm")
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".jfif", ".webp", ".bmp", ".ppm"})

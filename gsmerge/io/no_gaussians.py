@@ -5,11 +5,11 @@ from __future__ import annotations
 import os
 import shlex
 from contextlib import suppress
-from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 
 from gsmerge.errors import SceneError
+from gsmerge.frozen import dataclass
 from gsmerge.io.bounds import check_file
 from gsmerge.io.first_bytes import FOREIGN
 from gsmerge.io.formats.ply import header_content

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from gsmerge.errors import Doubt, SceneError, UsageError, name_notes
+from gsmerge.frozen import dataclass, field, replace
 from gsmerge.geometry.frame import scene_frame
 from gsmerge.geometry.transforms import IDENTITY, Similarity, euler_to_rotmat, normalize
 from gsmerge.io import GaussianFile, file_notes, read_cameras, read_gaussians

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, replace
 from pathlib import Path
 
 from gsmerge.errors import SceneError
+from gsmerge.frozen import dataclass, replace
 from gsmerge.io import file_notes
 from gsmerge.io.bounds import check_file
 from gsmerge.io.cameras.read_cameras import read_cameras

@@ -15,8 +15,9 @@ import subprocess
 import sys
 import sysconfig
 import tempfile
-from dataclasses import dataclass
 from pathlib import Path
+
+from gsmerge.frozen import dataclass
 
 FOLDER = Path(__file__).parent
 FLAGS = (

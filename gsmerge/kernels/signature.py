@@ -15,12 +15,12 @@ from __future__ import annotations
 import ctypes
 import inspect
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import cached_property, partial, wraps
 from typing import Any
 
 import numpy as np
 
+from gsmerge.frozen import dataclass
 from gsmerge.kernels.library import load_library
 
 _CODES = {

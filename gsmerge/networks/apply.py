@@ -9,12 +9,12 @@ formulas on tensors, so that gradients pass from stage to stage.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from gsmerge.arrays import Array, as_array, concat_columns, concat_rows, like
+from gsmerge.frozen import dataclass, replace
 from gsmerge.geometry.pooling import Members, feature_to_gaussians
 from gsmerge.geometry.transforms import covariances, rotation_entries, rotmat_to_quat
 from gsmerge.networks.corrections import HALF, move_features, move_gaussians, scale_outputs

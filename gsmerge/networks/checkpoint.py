@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ import numpy as np
 from safetensors.numpy import save
 
 from gsmerge.errors import SceneError
+from gsmerge.frozen import asdict, dataclass
 from gsmerge.io.atomic import atomic_output
 from gsmerge.io.bounds import ReadBudget, parse_json, read_budget
 from gsmerge.io.tensor_file import read_tensors

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
 from itertools import pairwise
 from typing import Any
 
+from gsmerge.frozen import dataclass, fields
 from gsmerge.networks.cross_view_stats import NUM_STATS
 from gsmerge.settings.setting import Settings, setting
 

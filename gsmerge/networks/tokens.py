@@ -8,11 +8,11 @@ units, inputs do not depend on depth, focal length, resolution or the scale of t
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gsmerge.arrays import Array, as_array
+from gsmerge.frozen import dataclass, replace
 from gsmerge.geometry.pooling import Members, feature_to_gaussians
 from gsmerge.kernels.networks.tokens import describe_groups, describe_parts, place_frames
 from gsmerge.networks.cross_view_stats import NUM_STATS, cross_view_stats

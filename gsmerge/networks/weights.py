@@ -8,13 +8,13 @@ on the other groups of a table nor on the number of threads.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
 
 from gsmerge.arrays import Array
+from gsmerge.frozen import dataclass, replace
 from gsmerge.kernels.networks.layers import (
     GELU,
     PLAIN,

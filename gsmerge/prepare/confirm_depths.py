@@ -9,10 +9,10 @@ does not count if other views have no Gaussian at its position, for example beyo
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
 
 import numpy as np
 
+from gsmerge.frozen import dataclass, field
 from gsmerge.geometry.frame import scene_depth
 from gsmerge.geometry.transforms import camera_depths, nearest_views, project
 from gsmerge.kernels.elementary import log

@@ -15,10 +15,10 @@ are nearer to new photos than photos of mean exposure are, by 1.5 dB in a video 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 
 import numpy as np
 
+from gsmerge.frozen import dataclass, replace
 from gsmerge.geometry.transforms import camera_distances, correlation, medians, order_others, rgb_to_sh0, sh0_to_rgb
 from gsmerge.kernels.elementary import exp, log
 from gsmerge.kernels.matrices import solve

@@ -8,11 +8,10 @@ view's farthest surface: the one at which the pictures of the nearest other view
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-
 import cv2
 import numpy as np
 
+from gsmerge.frozen import dataclass, replace
 from gsmerge.geometry.transforms import camera_depths, lies_inside, nearest_views, rgb_to_sh0
 from gsmerge.kernels.matrices import invert, matmul
 from gsmerge.kernels.pictures import blur

@@ -15,10 +15,10 @@ agrees no worse than with the old poses.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
+from gsmerge.frozen import dataclass
 from gsmerge.geometry.transforms import (
     camera_depths,
     median,

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
+from gsmerge.frozen import dataclass, replace
 from gsmerge.reading.photos.colors import map_tones
 from gsmerge.types import LargePhotos
 

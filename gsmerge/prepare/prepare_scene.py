@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 
+from gsmerge.frozen import dataclass, field, replace
 from gsmerge.geometry.frame import Frame, canonicalise, sample_rows
 from gsmerge.geometry.views import camera_kinds, subset
 from gsmerge.prepare.compare_photos import compare_photos

@@ -9,12 +9,12 @@ neither a colour nor an opaque drawing do not count.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import TypeVar
 
 import cv2
 import numpy as np
 
+from gsmerge.frozen import dataclass
 from gsmerge.geometry.transforms import camera_depths, sh0_to_rgb
 from gsmerge.geometry.views import camera_kinds, subset
 from gsmerge.kernels.pictures import blur

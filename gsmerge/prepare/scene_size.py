@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import reduce
 
 import numpy as np
 
+from gsmerge.frozen import dataclass
 from gsmerge.geometry.transforms import median, quantiles
 from gsmerge.geometry.views import camera_kinds
 from gsmerge.types import Gaussians, Scene

@@ -7,10 +7,10 @@ distance from the viewer. Because of this proportion, the sizes determine the vi
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
+from gsmerge.frozen import dataclass
 from gsmerge.geometry.transforms import median, robust_weights
 from gsmerge.kernels.elementary import cos, log, sin
 from gsmerge.kernels.matrices import matmul, solve_symmetric

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -11,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from gsmerge.arrays import Array as AnyArray
 from gsmerge.arrays import ArrayFields, as_array
+from gsmerge.frozen import dataclass
 from gsmerge.kernels.raster import blend as kernels
 from gsmerge.kernels.raster import project as projection
 from gsmerge.raster.tiled_view import Array, Splats, TiledView, make_splats, pieces, tile_ranges

@@ -5,11 +5,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 
+from gsmerge.frozen import dataclass, replace
 from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.raster import project as projection
 from gsmerge.kernels.raster.blend import blend_backward, gather_slots

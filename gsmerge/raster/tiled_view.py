@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
@@ -11,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gsmerge.arrays import distinct
+from gsmerge.frozen import dataclass
 from gsmerge.geometry.transforms import camera_centres, medians
 from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.raster import project as projection

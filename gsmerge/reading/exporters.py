@@ -6,10 +6,10 @@ To add a model, add a :class:`Model` to the exporter whose columns, order and en
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from gsmerge.frozen import dataclass, fields
 from gsmerge.io.cameras.table import FFGS
 from gsmerge.reading.alignment import ESTIMATED
 from gsmerge.settings.reading import SCENE_ARGUMENTS, Order, ReadHints

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-
 import numpy as np
 
+from gsmerge.frozen import dataclass, replace
 from gsmerge.io.cameras.camera_file import CameraFile, drop_repeats, missing_intrinsics, to_cameras, undistort_photos
 from gsmerge.io.cameras.read_cameras import read_cameras, read_sharp_camera
 from gsmerge.io.formats.read_gaussians import GaussianFile

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from gsmerge.errors import list_doubts
+from gsmerge.frozen import dataclass, field
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.formats.read_gaussians import FileInfo, kept_comments
 from gsmerge.io.formats.rows import FLAT_COMMENT

@@ -8,11 +8,11 @@ import re
 import shlex
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
 from itertools import islice, pairwise
 from pathlib import Path
 
 from gsmerge.errors import SceneError
+from gsmerge.frozen import dataclass, replace
 from gsmerge.io.bounds import check_file
 from gsmerge.io.cameras.foreign import check_program, find_unread
 from gsmerge.io.cameras.read_cameras import (

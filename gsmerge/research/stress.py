@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal
 
@@ -17,6 +16,7 @@ import cv2
 import numpy as np
 
 from gsmerge.errors import GsmergeError, UsageError
+from gsmerge.frozen import dataclass, replace
 from gsmerge.geometry.frame import Frame, scene_frame
 from gsmerge.geometry.transforms import move_views
 from gsmerge.geometry.views import even_views, subset, take_rows

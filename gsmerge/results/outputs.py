@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from gsmerge.errors import SceneError, UsageError
+from gsmerge.frozen import dataclass, field, replace
 from gsmerge.io.atomic import AddOutput, atomic_outputs
 from gsmerge.io.cameras.camera_file import to_cameras
 from gsmerge.io.cameras.read_cameras import read_cameras

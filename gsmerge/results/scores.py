@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 
 import numpy as np
 
+from gsmerge.frozen import dataclass, replace
 from gsmerge.geometry.views import scored_views
 from gsmerge.io.formats.write import round_as_written
 from gsmerge.plan import Plan

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from gsmerge.errors import UsageError
+from gsmerge.frozen import dataclass
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint

@@ -13,11 +13,11 @@ import socket
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, closing, contextmanager, suppress
-from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Any, NamedTuple, TypeVar
 
 from gsmerge.errors import SceneError, UsageError
+from gsmerge.frozen import dataclass, replace
 from gsmerge.runtime.record import Record, record_part, report_progress
 from gsmerge.runtime.threads import use_threads
 

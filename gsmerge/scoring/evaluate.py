@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
 from itertools import count
 
 import numpy as np
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 
 from gsmerge.arrays import ArrayFields, as_pictures
 from gsmerge.errors import Doubt, UsageError, list_doubts
+from gsmerge.frozen import dataclass, field, fields, replace
 from gsmerge.geometry.frame import scene_frame
 from gsmerge.geometry.views import pick_views
 from gsmerge.prepare.prepare_scene import scored_pictures

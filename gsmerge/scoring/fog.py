@@ -10,12 +10,12 @@ users.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
 from gsmerge.fit.report import HAZE
+from gsmerge.frozen import dataclass, replace
 from gsmerge.geometry.transforms import camera_depths, middle_depth, step_outside
 from gsmerge.geometry.views import pick_views
 from gsmerge.raster import Splats, make_splats, render

@@ -9,7 +9,6 @@ from __future__ import annotations
 import io
 import pickle
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property, lru_cache, reduce
 from importlib.util import find_spec
 from pathlib import Path
@@ -20,6 +19,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from gsmerge.arrays import Array
 from gsmerge.errors import GsmergeError, SceneError
+from gsmerge.frozen import dataclass
 from gsmerge.kernels.networks.layers import PLAIN, dense, pack_weights
 from gsmerge.raster.metrics import image_pair, pixel_mask
 from gsmerge.runtime.threads import parallel_map

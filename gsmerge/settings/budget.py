@@ -8,11 +8,11 @@ from __future__ import annotations
 import math
 import re
 import sys
-from dataclasses import dataclass
 from decimal import Decimal
 from fractions import Fraction
 
 from gsmerge.errors import UsageError
+from gsmerge.frozen import dataclass
 from gsmerge.settings.setting import Settings, setting, suggest_name
 
 UNIT_BYTES = {"B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "KIB": 2**10, "MIB": 2**20, "GIB": 2**30}

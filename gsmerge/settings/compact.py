@@ -6,9 +6,9 @@ Settings are grouped by stage. Users give each setting by its flat name, which i
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
+from gsmerge.frozen import dataclass
 from gsmerge.runtime import MOST_THREADS
 from gsmerge.runtime.plugins import METHODS, find_plugins
 from gsmerge.settings.budget import AUTO, BudgetOptions

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
+from gsmerge.frozen import dataclass
 from gsmerge.runtime import MOST_THREADS
 from gsmerge.settings.setting import Settings, setting
 

@@ -6,9 +6,9 @@ A state is a file to which further views can be added, and from which a result c
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
+from gsmerge.frozen import dataclass
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.setting import Settings, setting
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Literal
 
+from gsmerge.frozen import dataclass
 from gsmerge.settings.setting import Settings, setting
 
 AXES = ("x", "-x", "y", "-y", "z", "-z")

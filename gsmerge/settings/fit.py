@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
 from typing import Literal
 
+from gsmerge.frozen import dataclass, replace
 from gsmerge.settings.setting import Settings, setting
 
 Fit = Literal["full", "none"]

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from math import inf
 from typing import Literal
 
+from gsmerge.frozen import dataclass
 from gsmerge.settings.setting import Settings, setting
 
 OpacityChoice = Literal["auto", "logit", "raw"]

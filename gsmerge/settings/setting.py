@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import Field, dataclass, field, fields, is_dataclass, replace
 from functools import cache
 from inspect import cleandoc
 from math import inf
@@ -17,6 +16,8 @@ from numbers import Integral, Real
 from operator import ge, gt, le, lt
 from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+from gsmerge.frozen import Field, dataclass, field, fields, is_dataclass, replace
 
 T = TypeVar("T", bound="Settings")
 KIND_NAMES = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass
 from typing import Literal
 
+from gsmerge.frozen import dataclass
 from gsmerge.settings.budget import AUTO, parse_share
 from gsmerge.settings.setting import Settings, setting, suggest_name
 

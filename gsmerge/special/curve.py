@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 
 from gsmerge.fit.photo_sizes import holdout_psnr, training_weights
+from gsmerge.frozen import dataclass, replace
 from gsmerge.kernels.elementary import log, power
 from gsmerge.pipeline import build
 from gsmerge.plan import Plan

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from gsmerge.frozen import dataclass, replace
 from gsmerge.geometry.views import pick_views, subset
 from gsmerge.plan import Plan, make_plan
 from gsmerge.prepare.prepare_scene import Prepared, Reference

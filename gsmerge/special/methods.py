@@ -6,9 +6,9 @@ A package adds a method by an entry point of the group ``gsmerge.methods`` that 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 from gsmerge.errors import UsageError
+from gsmerge.frozen import dataclass
 from gsmerge.plan import Plan
 from gsmerge.prepare.prepare_scene import Prepared, prepare
 from gsmerge.runtime.plugins import METHODS, load_plugin

@@ -8,11 +8,11 @@ the Gaussians of the other views before and after compaction, over the pixels th
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from time import perf_counter
 
 import numpy as np
 
+from gsmerge.frozen import dataclass, replace
 from gsmerge.geometry.transforms import camera_distances
 from gsmerge.geometry.views import subset
 from gsmerge.kernels.elementary import power

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from threading import Lock
 
 import numpy as np
 
 from gsmerge.errors import UsageError
+from gsmerge.frozen import dataclass, replace
 from gsmerge.geometry.pooling import Members, scene_members
 from gsmerge.kernels.raster.contribution import dominant_labels
 from gsmerge.raster import TiledView

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 from gsmerge.errors import UsageError
+from gsmerge.frozen import dataclass
 from gsmerge.io.formats.table import PLY, Format, count_for_bytes, output_format
 from gsmerge.prepare.scene_size import SceneSize
 from gsmerge.settings.budget import AUTO, DEVICES, BudgetOptions, parse_budget, parse_bytes

@@ -8,12 +8,12 @@ surface beside the gap, at depths that no view contradicts.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
 from gsmerge.fit.outside import Outside
+from gsmerge.frozen import dataclass, replace
 from gsmerge.geometry.transforms import is_inside, project
 from gsmerge.geometry.views import resize_cameras
 from gsmerge.kernels.pictures import blur

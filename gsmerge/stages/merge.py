@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from gsmerge.arrays import Array, as_tensor, to_float32
+from gsmerge.frozen import dataclass
 from gsmerge.geometry.pooling import Members
 from gsmerge.kernels.gaussians.pool import gather_groups
 from gsmerge.networks.corrector import ANALYTIC, Corrector

@@ -9,10 +9,9 @@ depth are relative, far things count as much as near things.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
+from gsmerge.frozen import dataclass
 from gsmerge.geometry.transforms import camera_depths
 from gsmerge.kernels.elementary import log, log10
 from gsmerge.kernels.superpixels.merge_tree import (

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 from pathlib import PurePosixPath
 
 import numpy as np
@@ -11,6 +10,7 @@ import numpy as np
 from gsmerge.drawing.camera_path import outside_camera
 from gsmerge.drawing.pages.splats import MAX_GAUSSIANS, highest_degree, pack_splats
 from gsmerge.drawing.preview import OUTSIDE_VIEW, BytePicture, lay_on_chequer, to_picture
+from gsmerge.frozen import dataclass, replace
 from gsmerge.geometry.frame import Frame, scene_frame
 from gsmerge.geometry.transforms import middle_depth
 from gsmerge.geometry.views import even_views

@@ -7,7 +7,6 @@ import hashlib
 import html
 import json
 import re
-from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gsmerge.drawing.pages.data import PageView, ViewData
+from gsmerge.frozen import dataclass
 from gsmerge.prepare.row_colors import PHOTOS, ROW_COLORS
 from gsmerge.runtime.memory import human_bytes, human_share
 from gsmerge.types import Cameras

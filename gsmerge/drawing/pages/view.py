@@ -5,7 +5,6 @@ from __future__ import annotations
 import html
 import webbrowser
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
 from tempfile import mkdtemp
@@ -14,6 +13,7 @@ from typing import Any
 from gsmerge.drawing.pages.data import collect_page_data
 from gsmerge.drawing.pages.page import headline, view_page
 from gsmerge.errors import UsageError
+from gsmerge.frozen import dataclass, replace
 from gsmerge.io.atomic import atomic_output
 from gsmerge.io.first_bytes import may_be_replaced
 from gsmerge.io.formats.ply import file_bytes

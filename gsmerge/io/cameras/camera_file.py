@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -11,6 +10,7 @@ import cv2
 import numpy as np
 
 from gsmerge.errors import SceneError
+from gsmerge.frozen import dataclass, field, replace
 from gsmerge.geometry.transforms import Similarity, pose_changes
 from gsmerge.io.bounds import MAX_VIEWS, check_image_size
 from gsmerge.io.photo_files import PhotoArrays, PhotoTransform, Size, change_photos, photo_size, same_shape

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gsmerge.errors import SceneError
+from gsmerge.frozen import dataclass
 from gsmerge.io.bounds import read_json
 from gsmerge.io.cameras.camera_file import Convention, StoredView
 from gsmerge.io.formats.ply import Element, open_ply

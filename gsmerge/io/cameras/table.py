@@ -6,10 +6,10 @@ Files with a key for each value are read by their :class:`ViewLayout`, and files
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+from gsmerge.frozen import dataclass, replace
 from gsmerge.io.cameras.camera_file import C2W_OPENCV, C2W_OPENGL, W2C_OPENCV, CameraFile, Convention, make_camera_file
 from gsmerge.io.cameras.camera_source import CameraSource, StoredCameras
 from gsmerge.io.cameras.programs import (

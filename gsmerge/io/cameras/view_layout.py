@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -16,6 +15,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from gsmerge.errors import SceneError
+from gsmerge.frozen import dataclass, field
 from gsmerge.geometry.transforms import motion_matrices
 from gsmerge.io.cameras.camera_file import Lens, StoredView, check_camera_count, make_lens, make_pinhole
 from gsmerge.io.cameras.camera_source import (

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from gsmerge.errors import Note, SceneError
+from gsmerge.frozen import dataclass
 from gsmerge.io.formats import rows as arrays
 
 _MOMENT = "save one moment as a .ply, with positions, rotations and opacities of that time"

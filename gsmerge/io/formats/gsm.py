@@ -11,7 +11,6 @@ from __future__ import annotations
 import json
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +19,7 @@ from safetensors.numpy import save
 
 from gsmerge.arrays import as_array
 from gsmerge.errors import SceneError, count_words
+from gsmerge.frozen import dataclass, replace
 from gsmerge.io.atomic import atomic_output
 from gsmerge.io.bounds import check_image_size, parse_json, read_budget
 from gsmerge.io.cameras.camera_file import StoredView

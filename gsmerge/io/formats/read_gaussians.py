@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from gsmerge.errors import Doubt, Note, SceneError, count_words
+from gsmerge.frozen import dataclass
 from gsmerge.geometry.transforms import lower_median, rgb_to_sh0
 from gsmerge.io.formats import ply
 from gsmerge.io.formats import rows as arrays

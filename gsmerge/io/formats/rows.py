@@ -5,13 +5,13 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
 
 from gsmerge.arrays import Array, as_array
 from gsmerge.errors import Doubt, SceneError
+from gsmerge.frozen import dataclass, fields, replace
 from gsmerge.geometry.transforms import (
     apply_harmonics_rotation,
     harmonics_rotation,

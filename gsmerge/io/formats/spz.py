@@ -17,7 +17,6 @@ import struct
 import zlib
 from collections import deque
 from collections.abc import Iterable, Sequence
-from dataclasses import astuple, dataclass, replace
 from functools import reduce
 from itertools import chain, pairwise
 from pathlib import Path
@@ -27,6 +26,7 @@ import numpy as np
 
 from gsmerge.arrays import as_array, to_float32
 from gsmerge.errors import SceneError
+from gsmerge.frozen import astuple, dataclass, replace
 from gsmerge.geometry.transforms import rgb_to_sh0
 from gsmerge.io.bounds import ReadBudget, check_file, read_errors
 from gsmerge.io.formats import rows as arrays

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -13,6 +12,7 @@ import numpy as np
 
 from gsmerge.arrays import to_float32
 from gsmerge.errors import UsageError
+from gsmerge.frozen import dataclass, field
 from gsmerge.io.atomic import AddOutput
 from gsmerge.io.formats import ply
 from gsmerge.io.formats.rows import FLAT_COMMENT, MIP_COMMENT, StoredRows

@@ -6,13 +6,13 @@ The size of the scene shows whether scales are logarithms, as in most files, or 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from gsmerge.errors import SceneError
+from gsmerge.frozen import dataclass, replace
 from gsmerge.geometry.transforms import median, quantiles
 from gsmerge.io.formats import ply
 from gsmerge.io.formats import rows as arrays

@@ -5,11 +5,11 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from gsmerge.errors import SceneError
+from gsmerge.frozen import dataclass, field
 from gsmerge.io.bounds import check_file
 from gsmerge.io.jsonl import each_line
 from gsmerge.runtime.documents import document_head, file_sha256

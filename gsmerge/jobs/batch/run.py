@@ -13,13 +13,13 @@ import os
 import warnings
 from collections.abc import Generator, Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager, nullcontext, suppress
-from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from statistics import median_low
 from typing import Any
 
 from gsmerge.errors import SceneError, count_words, error_line
+from gsmerge.frozen import dataclass, replace
 from gsmerge.io.atomic import atomic_output, describe_existing, remove_stale
 from gsmerge.io.jsonl import append_line
 from gsmerge.io.locks import lock_file

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from gsmerge.errors import SceneError, split_notes
+from gsmerge.frozen import asdict, dataclass, replace
 from gsmerge.geometry.transforms import camera_centres, camera_distances
 from gsmerge.geometry.views import camera_kinds, concat_cameras, in_float64, resize_cameras, subset
 from gsmerge.io.photo_files import photo_array

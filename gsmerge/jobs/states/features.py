@@ -7,13 +7,13 @@ the result of ``compact``.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import cast
 
 import numpy as np
 
 from gsmerge.errors import UsageError
+from gsmerge.frozen import dataclass, fields, replace
 from gsmerge.geometry.frame import Frame
 from gsmerge.geometry.pooling import Members, feature_to_gaussians, gaussian_members
 from gsmerge.geometry.views import concat_cameras, resize_cameras

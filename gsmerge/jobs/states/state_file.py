@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from gsmerge.errors import count_words
+from gsmerge.frozen import asdict, dataclass, fields, replace
 from gsmerge.geometry.frame import Frame
 from gsmerge.io.cameras.camera_file import MAX_NUMBER, check_camera, check_size
 from gsmerge.io.formats.gsm import (

@@ -11,7 +11,6 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from gsmerge.errors import Note, SceneError
+from gsmerge.frozen import dataclass, replace
 from gsmerge.geometry.transforms import IDENTITY, Similarity, median
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.formats.read_gaussians import GaussianFile

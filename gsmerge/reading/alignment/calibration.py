@@ -9,10 +9,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
 
 import numpy as np
 
+from gsmerge.frozen import dataclass, replace
 from gsmerge.io.cameras.camera_file import make_pinhole
 from gsmerge.io.photo_files import Size
 from gsmerge.kernels.elementary import log

@@ -8,12 +8,12 @@ read, the Gaussians are wrong, and the result is marked as ``confirmed``. If pho
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from gsmerge.errors import SceneError
+from gsmerge.frozen import dataclass, replace
 from gsmerge.geometry.transforms import camera_depths, is_inside, project_points, robust_weights
 from gsmerge.io.cameras.camera_file import (
     CONVENTIONS,

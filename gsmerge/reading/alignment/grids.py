@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from gsmerge.errors import SceneError
+from gsmerge.frozen import dataclass, replace
 from gsmerge.geometry.transforms import IDENTITY, Similarity
 from gsmerge.io.cameras.camera_file import MAX_NORMALISED_FOCAL, CameraFile, Convention, sizes_of, to_cameras
 from gsmerge.io.cameras.table import FFGS

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
+
+from gsmerge.frozen import dataclass
 
 ESTIMATED = "estimated from the grid"  # the `source` of cameras that no file gives
 TRIMS = (8, 4, 2)  # pixels that DepthSplat, ZPressor and ReSplat cut off at every border

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 import sys
-from dataclasses import dataclass
 
 import numpy as np
 
+from gsmerge.frozen import dataclass
 from gsmerge.geometry.transforms import lower_median
 from gsmerge.kernels import reproject
 from gsmerge.reading.alignment.layouts import Layout, spread_step

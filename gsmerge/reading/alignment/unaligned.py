@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
 
 from gsmerge.errors import SceneError
+from gsmerge.frozen import dataclass, replace
 from gsmerge.geometry.transforms import IDENTITY, Similarity, is_inside, project_points, sh0_to_rgb
 from gsmerge.io.cameras.camera_file import Convention
 from gsmerge.kernels.elementary import exp

@@ -11,12 +11,12 @@ photo. Matches between such stretches are right if they agree on one frame, and 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
 from gsmerge.errors import SceneError
+from gsmerge.frozen import dataclass, replace
 from gsmerge.geometry.transforms import Similarity, sh0_to_rgb
 from gsmerge.kernels.matrices import matmul
 from gsmerge.reading.alignment.frames import UPRIGHT, ray_directions, solve_frame

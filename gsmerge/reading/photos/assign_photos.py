@@ -15,12 +15,12 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
+from gsmerge.frozen import dataclass, replace
 from gsmerge.geometry.transforms import median
 from gsmerge.kernels.pictures import turn_picture
 from gsmerge.reading.photos.offsets import NEAR_PIXELS, OFFSET_PIXELS, ZERO_OFFSET, PhotoOffsets, find_offsets

@@ -10,10 +10,10 @@ block is the error of its mean colour, because wrong depth moves few Gaussians i
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
+from gsmerge.frozen import dataclass
 from gsmerge.kernels.matrices import matmul, solve
 from gsmerge.reading.photos.similarity import stands_out
 from gsmerge.reading.photos.view_pictures import Pairs

@@ -10,13 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
 from itertools import product
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
 from gsmerge.errors import SceneError
+from gsmerge.frozen import dataclass, replace
 from gsmerge.geometry.views import pick_views
 from gsmerge.io.cameras.camera_file import CameraFile, sizes_of
 from gsmerge.io.photo_files import (

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from gsmerge.errors import Doubt, SceneError
+from gsmerge.frozen import dataclass
 from gsmerge.geometry.transforms import is_inside, project
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.image_names import find_image, match_masks

@@ -7,11 +7,11 @@ place clearly better than all other places. Offsets are zero if the photo is the
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
+from gsmerge.frozen import dataclass
 from gsmerge.geometry.transforms import NORMAL_SPREAD
 from gsmerge.raster.photos import shrink_pictures
 from gsmerge.reading.photos.similarity import NOISE_MARGIN, find_contrast, fisher_z

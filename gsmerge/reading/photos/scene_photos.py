@@ -10,7 +10,6 @@ import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path, PurePath
 from typing import Any
@@ -18,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from gsmerge.errors import Doubt, SceneError
+from gsmerge.frozen import dataclass, field, replace
 from gsmerge.io.cameras.camera_file import CameraFile, select_views, sizes_of
 from gsmerge.io.cameras.programs import SHARP
 from gsmerge.io.cameras.read_cameras import read_cameras

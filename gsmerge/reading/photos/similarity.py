@@ -9,11 +9,11 @@ photos and views are wrong, so the median absolute deviation of all z is the noi
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
+from gsmerge.frozen import dataclass
 from gsmerge.geometry.transforms import NORMAL_SPREAD, median
 from gsmerge.kernels.elementary import log
 from gsmerge.kernels.matrices import matmul

@@ -7,10 +7,10 @@ its weight. Photos and pictures are averaged with these weights, so pixels witho
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 
 import numpy as np
 
+from gsmerge.frozen import dataclass, replace
 from gsmerge.geometry.frame import Frame, canonicalise
 from gsmerge.geometry.transforms import sh0_to_rgb
 from gsmerge.raster.images import thin_out

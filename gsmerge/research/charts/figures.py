@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
+from gsmerge.frozen import dataclass
 from gsmerge.io import atomic_output
 from gsmerge.research.charts.lines import CHART_METRICS, MIN_SCENES, PARTS, Line, Results
 from gsmerge.research.charts.measure_run import INPUT

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
+from gsmerge.frozen import dataclass
 from gsmerge.research.charts.measure_run import INPUT, RunRecord
 from gsmerge.settings.compact import OURS
 

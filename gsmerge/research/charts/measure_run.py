@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+from gsmerge.frozen import asdict, dataclass, field, replace
 from gsmerge.geometry.views import subset
 from gsmerge.io.formats.ply import file_bytes
 from gsmerge.io.jsonl import each_line

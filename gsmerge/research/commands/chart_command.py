@@ -3,7 +3,6 @@
 import os
 import shlex
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,6 +12,7 @@ from gsmerge.cli.before_after import lpips_networks
 from gsmerge.cli.console import print_document, say_notes, stage_progress
 from gsmerge.cli.paths import write_texts
 from gsmerge.errors import UsageError
+from gsmerge.frozen import asdict, dataclass, replace
 from gsmerge.runtime.documents import document_head, note_entries
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.evaluate import NETS

@@ -1,6 +1,5 @@
 """``gsmerge lab generate``: make synthetic scenes."""
 
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -9,6 +8,7 @@ from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import print_document, stage_progress
 from gsmerge.cli.render_command import parse_size
 from gsmerge.errors import SceneError, count_words
+from gsmerge.frozen import dataclass
 from gsmerge.runtime.plugins import LazyFunction
 from gsmerge.settings.setting import Setting, Settings, setting
 

@@ -1,12 +1,12 @@
 """``gsmerge lab stress``: test a user's own scene under bad conditions."""
 
-from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Annotated
 
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.before_after import held_out_views, require_views
 from gsmerge.cli.console import print_document, say_notes, stage_progress
 from gsmerge.errors import TargetError
+from gsmerge.frozen import asdict, dataclass
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.setting import Settings, setting
 

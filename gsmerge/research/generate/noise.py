@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, make_dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import cv2
 import numpy as np
 
+from gsmerge.frozen import dataclass, fields, make_dataclass
 from gsmerge.kernels.elementary import exp, log
 from gsmerge.kernels.pictures import blur, convolve
 from gsmerge.kernels.raster.project import view_colors

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import cv2
 import numpy as np
 
+from gsmerge.frozen import asdict, dataclass, replace
 from gsmerge.geometry.transforms import quat_to_rotmat
 from gsmerge.kernels.elementary import cos, exp, sin
 from gsmerge.kernels.matrices import matmul

@@ -7,12 +7,12 @@ other photos of the capture show how well the merged Gaussians serve new views.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from threading import Lock
 
 import numpy as np
 import torch
 
+from gsmerge.frozen import dataclass, field
 from gsmerge.research.training.examples import Example, draw_random_views, make_example
 from gsmerge.research.training.scenes import make_training_scene
 from gsmerge.research.training.shards import Shard, hash_arrays

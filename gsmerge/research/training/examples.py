@@ -7,7 +7,6 @@ example has fixed views, of which a window may get a random choice (:func:`draw_
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from gsmerge.errors import SceneError
+from gsmerge.frozen import dataclass, fields, replace
 from gsmerge.geometry.pooling import Members, feature_to_gaussians
 from gsmerge.geometry.transforms import lower_median
 from gsmerge.raster.photos import Photos, blank_photos, scene_pictures

@@ -9,14 +9,13 @@ is added to results of kernels: this addition gives the results a gradient, and 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-
 import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from gsmerge.arrays import Array, as_array, as_tensor
+from gsmerge.frozen import dataclass, replace
 from gsmerge.geometry.pooling import MAX_OPACITY, Members, principal_axes
 from gsmerge.networks.apply import NetworkContext, prepare_children, run_heads
 from gsmerge.networks.corrections import (

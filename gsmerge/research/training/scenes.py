@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
+from gsmerge.frozen import dataclass
 from gsmerge.geometry.frame import canonicalise
 from gsmerge.geometry.pooling import Members, scene_members
 from gsmerge.geometry.views import concat_cameras, even_views, resize_cameras, subset

@@ -10,7 +10,6 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from gsmerge.errors import SceneError
+from gsmerge.frozen import dataclass, fields
 from gsmerge.geometry.pooling import Members
 from gsmerge.io.atomic import atomic_output
 from gsmerge.raster.photos import Photos

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
 from typing import Any
 
+from gsmerge.frozen import asdict, dataclass
 from gsmerge.kernels.raster.step import WINDOW_SIDE
 from gsmerge.networks.options import SLOTS, NetworkOptions
 from gsmerge.scoring.lpips import require_lpips

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from gsmerge.frozen import dataclass
 from gsmerge.raster import make_splats, tile_view
 from gsmerge.raster.photos import NEAR_PLANE, Photos
 from gsmerge.research.training.examples import Example

@@ -8,10 +8,10 @@ surfaces with the block.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 
 import numpy as np
 
+from gsmerge.frozen import dataclass, field
 from gsmerge.geometry.transforms import camera_centres, project
 from gsmerge.kernels.reproject import see_points
 from gsmerge.runtime.memory import free_pages

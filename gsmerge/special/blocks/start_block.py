@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-
 import numpy as np
 
+from gsmerge.frozen import dataclass, replace
 from gsmerge.geometry.frame import Frame
 from gsmerge.pipeline import merge_views
 from gsmerge.plan import Plan, make_plan

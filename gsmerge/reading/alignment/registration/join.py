@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from gsmerge.errors import Doubt, SceneError, count_words
+from gsmerge.frozen import dataclass, replace
 from gsmerge.geometry.transforms import Similarity, rotmat_to_quat
 from gsmerge.kernels.elementary import arccos
 from gsmerge.reading.alignment.registration.register import register

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
 
 import cv2
 import numpy as np
 
+from gsmerge.frozen import dataclass, fields, replace
 from gsmerge.geometry.transforms import camera_depths, lower_median
 from gsmerge.kernels.matrices import invert, matmul
 from gsmerge.raster.photos import row_pictures

@@ -10,11 +10,11 @@ be wrong, errors along a point's ray count less.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
 
+from gsmerge.frozen import dataclass, replace
 from gsmerge.geometry.transforms import (
     IDENTITY,
     NORMAL_SPREAD,
