@@ -28,8 +28,6 @@ def nodes(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Module
     for name, module in modules(tmp_path).items():
         monkeypatch.setitem(sys.modules, name, module)
     spec = importlib.util.spec_from_file_location("gsmerge_nodes", root / "examples" / "comfyui" / "__init__.py")
-    assert spec is not None
-    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     for name in ("seen", "cancelled"):
@@ -92,7 +90,6 @@ def test_cameras_are_those_of_the_scene(nodes: ModuleType, scene: gsmerge.Scene)
 
 
 def test_splats_are_fitted_to_images(nodes: ModuleType, scene: gsmerge.Scene) -> None:
-    assert scene.images is not None
     images = [torch.from_numpy(np.stack(list(scene.images[i : i + 1]))).float() for i in range(len(scene.images))]
     views = {"images": images, "camera_info": make_cameras(scene.cameras)}
     splat = make_splat(scene.gaussians)

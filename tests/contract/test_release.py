@@ -49,7 +49,6 @@ def _numbers(version: str) -> list[int]:
 def test_the_record_is_of_the_newest_section_with_a_date(root: Path, tool: dict[str, Any]) -> None:
     changelog = (root / "CHANGELOG.md").read_text(encoding="utf-8")
     newest = re.search(r"^## (\d\S+) \((\d{4}-\d\d-\d\d)\)$", changelog, re.MULTILINE)
-    assert newest is not None
     assert json.loads(tool["RECORD"].read_text(encoding="utf-8"))["version"] == newest[1]
     section = changelog[newest.end() :].partition("\n## ")[0]
     assert len([line for line in section.splitlines() if line.strip()]) <= MOST_LINES

@@ -157,7 +157,7 @@ def lack_attribute(name: str) -> Damage:
 
 def chain_nodes(parsed: dict[str, Any]) -> None:
     """Put nodes into one another, of which the last has the Gaussians."""
-    parsed["nodes"] = [{"children": [i + 1], "scale": [2, 2, 2]} for i in range(DEEP)] + parsed["nodes"]
+    parsed["nodes"] = [{"children": [i + 1], "scale": [2, 2, 2]} for i in range(DEEP // 5)] + parsed["nodes"]
 
 
 def put_nodes(count: int, node: dict[str, int]) -> Change:
@@ -207,7 +207,7 @@ def of_glb() -> dict[str, Damage]:
         "a node that stretches the Gaussians": refuse(set_json("nodes", 0, "scale", value=[1, 2, 1]), "stretches"),
         "a node that mirrors the Gaussians": refuse(set_json("nodes", 0, "scale", value=[-1, -1, -1]), "mirrors"),
         "two nodes with the same Gaussians": refuse(put_nodes(2, {"mesh": 0}), "same values"),
-        "100,000 nodes in one another": refuse(edit_json(chain_nodes), slow=True),
+        "20,000 nodes in one another": refuse(edit_json(chain_nodes), slow=True),
         "100,000 nodes with the same Gaussians": refuse(put_nodes(DEEP, {"mesh": 0}), slow=True),
         "200,000 empty nodes": refuse(put_nodes(200_000, {}), slow=True),
         "positions as the values of all harmonics": refuse(edit_json(share_positions), "same values"),

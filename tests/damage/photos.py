@@ -128,7 +128,7 @@ def of_png() -> dict[str, Damage]:
             name_one_photo, "300 of 2000 x 2000", place="scene", compacts=True, slow=True
         ),
         "60 packed texts of 1 MB in every PNG": accept(edit_all(add_chunks(texts())), slow=True),
-        "a million empty chunks in every PNG": allow(edit_all(add_chunks(chunk(b"IDAT", b"") * 1_000_000)), slow=True),
+        "300,000 empty chunks in every PNG": allow(edit_all(add_chunks(chunk(b"IDAT", b"") * 300_000)), slow=True),
         "a shell script in its place": refuse(edit_bytes(lambda data: b"#!/bin/sh\ntouch executed\n")),
         "a chunk that claims 4 GB": refuse(edit_bytes(put_numbers(33, ">I", 2**32 - 1))),
         "all photos as JPEG of four channels without pixels": allow(edit_all(cmyk)),

@@ -233,7 +233,9 @@ def test_scaled_and_turned_gaussians_have_exact_positions_and_shapes(result: Pat
     np.testing.assert_allclose(covariances(after.quats, after.scales), expected, atol=1e-5)
 
 
-def test_the_command(small_scene: Path, tmp_path: Path, result: Path, run: Run) -> None:
+def test_convert_takes_files_and_folders_and_never_replaces_its_input(
+    small_scene: Path, tmp_path: Path, result: Path, run: Run
+) -> None:
     done = run("convert", result, tmp_path / "b.spz", "--up", "y", code=0)
     assert done.out.startswith(f"{tmp_path / 'b.spz'}: 400 Gaussians")
     assert "b.cameras.json" in done.out

@@ -34,7 +34,12 @@ class Kind:
     pattern: str
     sound: str = "scene"
     change: Callable[[Path], Any] = lambda _: None  # what is done to the folder first
-    words: tuple[str, ...] = ("compact", "--dry-run", "{}")  # the last is what is checked, {} the folder
+    words: tuple[str, ...] = (
+        "compact",
+        "--dry-run",
+        "--budget=50%",
+        "{}",
+    )  # the last is what is checked, {} the folder
     named: tuple[str, str] | tuple[()] = ()  # option and file: what is only found beside a scene is left out
     many: int = MANY  # mutations in the sweep
 

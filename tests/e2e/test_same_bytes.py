@@ -15,8 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from exact_results import hash_of_all, make_results
-
-from gsmerge.kernels.library import _runnable_targets
+from targets import runnable_targets
 
 # One hash of the script's nine results, on every machine. After a change of results on purpose the failing test prints
 # the new one.
@@ -41,7 +40,7 @@ def test_this_machine_gives_the_same_bytes(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("target", [target.name for target in _runnable_targets()])
+@pytest.mark.parametrize("target", runnable_targets())
 def test_every_machine_gives_the_same_bytes(target: str) -> None:
     env = os.environ | plain() | {"GSMERGE_TARGET": target}
     done = subprocess.run([sys.executable, str(SCRIPT)], env=env, capture_output=True, text=True, check=False)

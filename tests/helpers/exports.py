@@ -138,7 +138,6 @@ def home(scene: Scene, tiny: Tiny, kept: np.ndarray | None = None) -> float:
 
 def of_pixels(scene: Scene, name: str) -> np.ndarray:
     """Return a column of the Gaussian in front of each pixel, over all views; 0 where there is none."""
-    assert scene.pixels is not None
     values = getattr(scene.gaussians, name)[scene.pixels.fronts.reshape(-1)].copy()
     values[~scene.pixels.shown.reshape(-1)] = 0
     return values

@@ -123,8 +123,6 @@ class CommandServer:
         self._process.communicate()
 
     def _ask(self, question: dict[str, object]) -> dict[str, object]:
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
         self._process.stdin.write(json.dumps(question) + "\n")
         self._process.stdin.flush()
         return json.loads(self._process.stdout.readline())

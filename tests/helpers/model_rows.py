@@ -235,7 +235,6 @@ def check_cameras(scene: Scene, export: Export) -> None:
     middle = np.median(np.stack([export.rows[name] for name in "xyz"], 1), 0)
     size = np.linalg.norm(poses[:, :3, 3] - middle, axis=1).max()
     assert np.abs(scene.cameras.centres[::layers] - poses[:, :3, 3]).max() < 0.01 * size
-    assert scene.images is not None
     for image, photo in zip(scene.images[::layers], export.scene.images, strict=True):
         expected = cv2.resize(photo, image.shape[1::-1], interpolation=cv2.INTER_CUBIC)
         assert np.abs(image - expected / 255).mean() < 0.02

@@ -192,7 +192,6 @@ def make_scene(
 
 def shown_in(scene: Scene, mask: np.ndarray) -> Scene:
     """Return the scene with only the Gaussians of the pixels ``mask [v,h,w]``."""
-    assert scene.pixels is not None
     return take_rows(scene, np.flatnonzero(mask.reshape(-1)[scene.pixels.homes]))
 
 
@@ -289,7 +288,6 @@ def bare(gaussians: Gaussians) -> Scene:
 
 def psnr_of(gaussians: Gaussians, scene: Scene) -> float:
     """Return the PSNR (dB) over all views of a scene with photos."""
-    assert scene.images is not None
     image = np.clip(images_of(gaussians, scene.cameras)[0], 0, 1)
     return float(-10 * elementary.log10(((image - scene.images.astype(np.float64)) ** 2).mean()))
 

@@ -6,10 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsmerge import Cameras, Gaussians, Scene
+from gsmerge import Gaussians, Scene
 from gsmerge.geometry.transforms import normalize
-
-NO_CAMERAS = Cameras(np.empty((0, 4, 4)), np.empty((0, 3, 3)), 1, 1)
 
 
 def without_order(scene: Scene, order: np.ndarray | None = None) -> Scene:

@@ -6,8 +6,9 @@ from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 import pytest
+from targets import runnable_targets
 
-from gsmerge.kernels.library import _runnable_targets, load_library
+from gsmerge.kernels.library import load_library
 
 Function = Callable[[], Sequence[np.ndarray]]
 
@@ -18,8 +19,8 @@ def each_target(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[Function]
 
     def run(function: Function) -> Sequence[np.ndarray]:
         results = []
-        for target in _runnable_targets():
-            monkeypatch.setenv("GSMERGE_TARGET", target.name)
+        for target in runnable_targets():
+            monkeypatch.setenv("GSMERGE_TARGET", target)
             load_library.cache_clear()
             results.append(function())
         for other in results[1:]:

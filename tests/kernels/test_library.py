@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 from messages import ERROR, refuses
 from numpy.random import mtrand
+from targets import runnable_targets
 
 from gsmerge.errors import UsageError
 from gsmerge.kernels import library as module
@@ -50,7 +51,7 @@ def set_level(monkeypatch: pytest.MonkeyPatch, level: int) -> None:
 
 
 def test_most_demanding_target_of_the_processor_is_loaded() -> None:
-    assert load_library()._name == str(FOLDER / find_platform().library_name(module._runnable_targets()[-1]))
+    assert load_library()._name == str(FOLDER / f"kernels-{runnable_targets()[-1]}{find_platform().suffix}")
 
 
 @x86_only
@@ -82,17 +83,23 @@ def test_a_target_beyond_the_processor_is_refused(monkeypatch: pytest.MonkeyPatc
         load_library()
 
 
-def test_a_missing_library_names_the_command_that_builds_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+@pytest.mark.skipif(sys.platform != "linux", reason="a library that is there")
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (None, r"the native library is missing; run python tasks.py native, or pip install"),
+        (b"no library", r"kernels-.*loaded"),
+        (Path(mtrand.__file__).read_bytes(), r"kernels-.*loaded \(.*sources_hash\); run python tasks.py native"),
+    ],
+    ids=["missing", "damaged", "without our functions"],
+)
+def test_a_library_that_is_none_of_ours_names_the_command_that_builds_it(
+    content: bytes | None, said: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    for target in find_platform().targets if content else ():
+        (tmp_path / find_platform().library_name(target)).write_bytes(content)
     monkeypatch.setenv("GSMERGE_NATIVE", str(tmp_path))
-    with pytest.raises(UsageError, match=r"the native library is missing; run python tasks.py native, or pip install"):
-        load_library()
-
-
-def test_a_damaged_library_names_the_command_that_builds_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    for target in find_platform().targets:
-        (tmp_path / find_platform().library_name(target)).write_bytes(b"no library")
-    monkeypatch.setenv("GSMERGE_NATIVE", str(tmp_path))
-    with pytest.raises(UsageError, match=r"kernels-.*loaded"):
+    with pytest.raises(UsageError, match=said):
         load_library()
 
 
@@ -102,17 +109,6 @@ def test_memory_that_does_not_suffice_for_the_library_is_called_so(monkeypatch: 
 
     monkeypatch.setattr(module.ctypes, "CDLL", load)
     with pytest.raises(MemoryError):
-        load_library()
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="a library that is there")
-def test_library_without_our_functions_names_the_command_that_builds_it(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    for target in find_platform().targets:
-        shutil.copy(mtrand.__file__, tmp_path / find_platform().library_name(target))
-    monkeypatch.setenv("GSMERGE_NATIVE", str(tmp_path))
-    with pytest.raises(UsageError, match=r"kernels-.*loaded \(.*sources_hash\); run python tasks.py native"):
         load_library()
 
 

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+import scenes
+from plyfile import PlyData, PlyElement
 
+from gsmerge.io.formats import read_gaussians
 from gsmerge.io.formats import rows as arrays
-from gsmerge.io.formats.read_gaussians import _convert_with_kernel, _convert_with_numpy
+from gsmerge.kernels.stored_rows import convert_rows
 
 N = 200
 ODD = {
@@ -16,9 +21,9 @@ ODD = {
 }  # fmt: skip
 
 
-def make_rows(num_higher: int, seed: int = 0) -> np.ndarray:
+def make_rows(num_higher: int) -> np.ndarray:
     """Make rows of plain Gaussians with two columns beside what is used, all columns in a mixed order."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     names = [*arrays.REQUIRED_COLUMNS, *arrays.NORMALS[:2], *(f"f_rest_{i}" for i in range(3 * num_higher))]
     rows = np.empty(N, [(name, "<f4") for name in rng.permutation(names)])
     for name in names:
@@ -26,49 +31,63 @@ def make_rows(num_higher: int, seed: int = 0) -> np.ndarray:
     return rows
 
 
-def empty_arrays(num_higher: int, means: str = "f4") -> dict[str, np.ndarray]:
-    shapes = {"quats": (N, 4), "scales": (N, 3), "opacities": (N,), "sh0": (N, 1, 3), "shN": (N, num_higher, 3)}
-    out = {name: np.full(shape, 7, np.float32) for name, shape in shapes.items()}
-    return out | {"means": np.full((N, 3), 7, means), "valid": np.zeros(N, np.bool_)}
+@pytest.fixture
+def native(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Return how many rows each call of the kernel has converted."""
+    counts = list[int]()
+
+    def counted(*arguments: np.ndarray) -> int:
+        counts.append(convert_rows(*arguments))
+        return counts[-1]
+
+    monkeypatch.setattr(read_gaussians, "convert_rows", counted)
+    return counts
 
 
-def assert_same(rows: np.ndarray, num_higher: int, means: str = "f4") -> None:
-    fast, slow = empty_arrays(num_higher, means), empty_arrays(num_higher, means)
-    num_done = _convert_with_kernel(rows, fast)
-    counts = _convert_with_numpy(rows[num_done:], {name: array[num_done:] for name, array in fast.items()})
-    assert counts == _convert_with_numpy(rows, slow)
-    for name, values in slow.items():
-        assert fast[name].tobytes() == values.tobytes(), name
+def assert_same(folder: Path, rows: np.ndarray) -> None:
+    """Read a file as it is, and with a column of doubles that nothing uses: all columns are then taken one by one."""
+    wide = np.zeros(N, [*rows.dtype.descr, ("label", "<f8")])
+    for name in rows.dtype.names or ():
+        wide[name] = rows[name]
+    files = []
+    for name, each in (("a.ply", rows), ("b.ply", wide)):
+        PlyData([PlyElement.describe(each, "vertex")], byte_order="<").write(str(folder / name))
+        files.append(read_gaussians.read_ply(folder / name))
+    native, by_columns = files
+    assert scenes.identical(native.gaussians, by_columns.gaussians)
+    assert native.valid.tobytes() == by_columns.valid.tobytes()
+    for name in ("num_nonfinite", "num_empty", "num_zero_quats", "adapted", "opacity_encoding"):
+        assert getattr(native.info, name) == getattr(by_columns.info, name), name
 
 
 @pytest.mark.parametrize("num_higher", [0, 3, 15])
-def test_plain_rows_are_converted_at_once(num_higher: int) -> None:
-    rows = make_rows(num_higher)
-    assert _convert_with_kernel(rows, empty_arrays(num_higher)) == N
-    assert_same(rows, num_higher)
+def test_plain_rows_are_converted_at_once(num_higher: int, native: list[int], tmp_path: Path) -> None:
+    assert_same(tmp_path, make_rows(num_higher))
+    assert native == [N]
 
 
 @pytest.mark.parametrize("row", [0, 63, 64, N - 1])
 @pytest.mark.parametrize(("name", "value"), [(name, value) for name, values in ODD.items() for value in values])
-def test_rows_from_an_odd_one_on_are_taken_by_columns(name: str, value: float, row: int) -> None:
+def test_rows_from_an_odd_one_on_are_taken_by_columns(
+    name: str, value: float, row: int, native: list[int], tmp_path: Path
+) -> None:
     rows = make_rows(3)
     rows[name][row] = value
-    assert (_convert_with_kernel(rows, empty_arrays(3)) == N) == (value == 9e12)
-    assert_same(rows, 3)
+    assert_same(tmp_path, rows)
+    assert (native == [N]) == (value == 9e12)
 
 
 @pytest.mark.parametrize("size", [0, 1e-20, 1e-16, 1e-14])
-def test_rows_of_zero_or_tiny_rotations_are_taken_by_columns(size: float) -> None:
+def test_rows_of_zero_or_tiny_rotations_are_taken_by_columns(size: float, native: list[int], tmp_path: Path) -> None:
     rows = make_rows(0)
     for name in arrays.QUATS:
         rows[name][70] *= np.float32(size)
-    assert _convert_with_kernel(rows, empty_arrays(0)) == (64 if size < 1e-14 else N)
-    assert_same(rows, 0)
+    assert_same(tmp_path, rows)
+    assert native == [64 if size < 1e-14 else N]
 
 
-@pytest.mark.parametrize("kinds", [{"x": "<f8"}, {"f_dc_0": "<i2"}, {"opacity": ">f4"}])
-def test_other_types_are_taken_by_columns(kinds: dict[str, str]) -> None:
+@pytest.mark.parametrize(("name", "kind"), [("x", "<f8"), ("f_dc_0", "<f8"), ("opacity", "<f8")])
+def test_other_types_are_taken_by_columns(name: str, kind: str, native: list[int], tmp_path: Path) -> None:
     rows = make_rows(0)
-    other = rows.astype([(name, kinds.get(name, "<f4")) for name in rows.dtype.names or ()])
-    assert _convert_with_kernel(other, empty_arrays(0)) == 0
-    assert_same(other, 0, "f8" if "x" in kinds else "f4")
+    assert_same(tmp_path, rows.astype([(each, kind if each == name else "<f4") for each in rows.dtype.names or ()]))
+    assert native == []

@@ -19,6 +19,7 @@ SEGMENTATIONS = [
     ("bass", {}),
     ("bass-st", {}),
     ("slic", {}),
+    *(("rdseg", {"compactness": value}) for value in (0.0, 1e-3, 1.0)),
 ]
 
 
@@ -57,24 +58,14 @@ def counts_of(num_pixels: int) -> list[int]:
 
 
 @pytest.mark.parametrize("picture", PICTURES)
-@pytest.mark.parametrize(("segmentation", "rounds"), SEGMENTATIONS)
+@pytest.mark.parametrize(("segmentation", "options"), SEGMENTATIONS)
 def test_partitions_are_exact_for_any_picture_and_segmentation(
-    picture: str, segmentation: str, rounds: dict[str, Any]
+    picture: str, segmentation: str, options: dict[str, Any]
 ) -> None:
     image = PICTURES[picture]
     height, width, _ = image.shape
     for count in counts_of(height * width):
-        labels = superpixels(image, count, segmentation, **rounds)
-        assert_partition(labels, height, width, count)
-
-
-@pytest.mark.parametrize("compactness", [0.0, 1e-3, 1.0])
-@pytest.mark.parametrize("picture", PICTURES)
-def test_partitions_are_exact_for_any_compactness(picture: str, compactness: float) -> None:
-    image = PICTURES[picture]
-    height, width, _ = image.shape
-    for count in counts_of(height * width):
-        labels = superpixels(image, count, compactness=compactness)
+        labels = superpixels(image, count, segmentation, **options)
         assert_partition(labels, height, width, count)
 
 

@@ -25,7 +25,7 @@ def test_result_does_not_depend_on_the_order_of_views(order: list[int], k: int) 
 
 @FEW
 @given(st.integers(0, 1000), st.floats(-4, 4), st.sampled_from([{}, {"match": "none"}, {"k": 2}]))
-def test_similarity(seed: int, exponent: float, options: dict) -> None:
+def test_a_run_of_a_moved_scene_is_the_moved_result(seed: int, exponent: float, options: dict) -> None:
     rng = np.random.default_rng(seed)
     factor = 10.0**exponent
     transform = scenes.random_rotation(seed), factor, factor * rng.uniform(-10, 10, 3)

@@ -1,7 +1,7 @@
 """Photos under the names that a camera file gives stay, however noisy rows in no order are (stability.md, case 70).
 
 Wrong depth displaces drawings of such rows, and large Gaussians hide in places what photos show. A seed of the smallest
-size takes two CPU seconds, half of them to be made: the first three lost photos while these had to be like drawings.
+size takes two CPU seconds, half of them to be made; of the largest size twenty.
 """
 
 from __future__ import annotations
@@ -18,8 +18,9 @@ from gsmerge.reading.read_scene import load_scene
 from gsmerge.runtime.record import record_run
 
 VIEWS = 6
-SEEDS = (20, 4, 9, 0, 1, 2, 3, 5, 6, 7, 8, 10)
-SIZES = ((192, 128), (320, 214), (480, 320))
+SEEDS = (20, 4, 9, 0, 1, 2, 3, 5, 6, 7, 8, 10)  # the first three lost photos while these had to be like drawings
+SIZES = {(192, 128): SEEDS, (320, 214): SEEDS[:4], (480, 320): SEEDS[:2]}
+CASES = [(size, seed) for size, seeds in SIZES.items() for seed in seeds]
 
 
 def shuffle_rows(ply: Path) -> None:
@@ -29,12 +30,7 @@ def shuffle_rows(ply: Path) -> None:
     ply.write_bytes(head + end + np.random.default_rng(0).permutation(rows).tobytes())
 
 
-@sweep(
-    ("size", "seed"),
-    [(size, seed) for size in SIZES for seed in SEEDS],
-    ids=[f"{width} x {height} seed {seed}" for width, height in SIZES for seed in SEEDS],
-    often=3,
-)
+@sweep(("size", "seed"), CASES, ids=[f"{width} x {height} seed {seed}" for (width, height), seed in CASES], often=1)
 def test_photos_named_by_cameras_stay_beside_noisy_rows(tmp_path: Path, size: Any, seed: int) -> None:
     folder = write_scene(tmp_path / "room", num_views=VIEWS, width=size[0], height=size[1], seed=seed)
     shuffle_rows(folder / "scene.ply")

@@ -15,6 +15,7 @@ from sweeps import sweep
 
 from gsmerge import Gaussians, Scene, compact, render
 from gsmerge.results.result import CompactResult
+from gsmerge.types import NO_CAMERAS, make_scene
 
 
 @pytest.fixture(scope="module")
@@ -106,7 +107,7 @@ def test_scene_without_photos_reaches_the_floor(room: Scene, floor: Callable[...
 
 
 def test_scene_without_cameras_reaches_the_floor(room: Scene, floor: Callable[..., None]) -> None:
-    blind = Scene(unaligned_scenes.shuffled(room).gaussians, unaligned_scenes.NO_CAMERAS, None, None, ())
+    blind = make_scene(unaligned_scenes.shuffled(room).gaussians, NO_CAMERAS)
     result = compacted(blind, fit_steps=60)
     assert noted(result.report.notes, "no", "cameras")
     own = render(room.gaussians, room.cameras).images.clip(0, 1)
@@ -117,7 +118,7 @@ def test_cameras_are_placed_as_well_far_from_the_origin(room: Scene) -> None:
     """In geographic coordinates cameras are placed as well as at home."""
     g, shift = room.gaussians, np.array([1e6, -3e6, 400.0])
     there = replace(g, means=g.means + shift)
-    one, other = (compacted(Scene(x, unaligned_scenes.NO_CAMERAS, None, None, ()), fit="none") for x in (g, there))
+    one, other = (compacted(make_scene(x, NO_CAMERAS), fit="none") for x in (g, there))
     assert abs(len(one.gaussians) - len(other.gaussians)) <= 0.1 * len(one.gaussians)
     middle = other.gaussians.means.mean(0, np.float64) - shift
     assert np.abs(middle - one.gaussians.means.mean(0, np.float64)).max() < 0.3

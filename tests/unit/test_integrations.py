@@ -80,7 +80,7 @@ def assert_holds(given: dict[str, Any], scene: Scene, *, quats: bool = True) -> 
     assert small.report.psnr_after > 15
 
 
-def test_depth_anything_3(scene: Scene) -> None:
+def test_output_of_depth_anything_3_holds_the_scene(scene: Scene) -> None:
     given = integrations.depth_anything_3(prediction_of(scene))
     assert_holds(given, scene)
     assert given["shN"].shape[1] == 0
@@ -102,7 +102,7 @@ def test_rotations_of_depth_anything_3_get_no_note(scene: Scene) -> None:
     assert not noted(notes, "w", "last")
 
 
-def test_depth_anything_3_in_metres_and_after_writing_colmap(scene: Scene) -> None:
+def test_depth_anything_3_in_metres_and_after_writing_colmap_holds_the_scene(scene: Scene) -> None:
     """The nested models scale the poses alone; its COLMAP writer leaves intrinsics at the original photos' size."""
     metric, original = scene.cameras.viewmats[:, :3].copy(), scene.cameras.Ks * np.array([2.5, 2.4, 1])[:, None]
     metric[:, :, 3] *= 4
@@ -111,12 +111,12 @@ def test_depth_anything_3_in_metres_and_after_writing_colmap(scene: Scene) -> No
     np.testing.assert_array_equal(prediction.extrinsics, metric)
 
 
-def test_depth_anything_3_without_gaussians(scene: Scene) -> None:
+def test_output_of_depth_anything_3_without_gaussians_is_refused(scene: Scene) -> None:
     with refuses(SceneError, "prediction", "gaussians", "infer_gs=True"):
         integrations.depth_anything_3(prediction_of(scene, gaussians=None))
 
 
-def test_anysplat(scene: Scene) -> None:
+def test_output_of_anysplat_holds_the_scene(scene: Scene) -> None:
     """Voxels: fewer Gaussians than pixels, in another order."""
     rows = np.random.default_rng(0).permutation(len(scene.gaussians))[:-50]
     fewer = replace_gaussians(scene, scene.gaussians[rows])
@@ -137,7 +137,7 @@ def replace_gaussians(scene: Scene, gaussians: Gaussians) -> Any:
 
 
 @pytest.mark.parametrize("wrapped", [False, True])
-def test_depthsplat(scene: Scene, wrapped: bool) -> None:
+def test_output_of_depthsplat_holds_the_scene(scene: Scene, wrapped: bool) -> None:
     """Rotations beside the covariances are the cameras', and are not read."""
     gaussians = family(scene)
     del gaussians.rotations, gaussians.scales
@@ -167,7 +167,7 @@ def ffgs_output(scene: Scene, degree: int | None, cameras: Any) -> SimpleNamespa
 
 @pytest.mark.parametrize("degree", [None, 0, 1])
 @pytest.mark.parametrize("given", [False, True])
-def test_ffgs(scene: Scene, degree: int | None, given: bool) -> None:
+def test_output_of_ffgs_holds_the_scene(scene: Scene, degree: int | None, given: bool) -> None:
     cameras = ffgs_cameras(scene)
     images = batch(photos_of(scene).transpose(0, 3, 1, 2))
     output = ffgs_output(scene, degree, None if given else cameras)
@@ -180,7 +180,7 @@ def test_ffgs(scene: Scene, degree: int | None, given: bool) -> None:
     assert arguments["order"] == "none"
 
 
-def test_ffgs_without_photos_or_cameras(scene: Scene) -> None:
+def test_output_of_ffgs_without_photos_or_cameras_is_compacted(scene: Scene) -> None:
     arguments = integrations.ffgs(ffgs_output(scene, 0, ffgs_cameras(scene)))
     assert (arguments["shape"], "images" in arguments) == ((3, 36, 48), False)
     assert 0 < len(compact_tensors(**arguments, **FAST).gaussians) < 0.3 * len(scene.gaussians)
@@ -189,7 +189,7 @@ def test_ffgs_without_photos_or_cameras(scene: Scene) -> None:
         integrations.ffgs(SimpleNamespace(gaussians=None, cameras=None))
 
 
-def test_worldmirror(scene: Scene) -> None:
+def test_output_of_worldmirror_holds_the_scene(scene: Scene) -> None:
     """Voxels: fewer Gaussians than pixels; columns are lists of one scene, or have its axis."""
     fewer = replace_gaussians(scene, scene.gaussians[::2])
     g = fewer.gaussians

@@ -77,7 +77,6 @@ def test_a_result_shows_its_scene_beside_it(
     page = result.show()
     assert re.match(r"Page\(4.3 % of the Gaussians, \d.\d dB closer to its own photos, \d", repr(page))
     shown = re.fullmatch(r'<iframe srcdoc="([^"]*)" style="[^"]*" allowfullscreen></iframe>', page._repr_html_())
-    assert shown is not None
     assert html.unescape(shown[1]) == page.text
     assert page.text.count('class="card"') >= len(scene)
     path = page.save(tmp_path / "page.html")

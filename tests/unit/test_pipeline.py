@@ -25,7 +25,7 @@ def scene() -> Scene:
     return scenes.make_scene(scenes.room(), scenes.arc(3, 32, 24), noise=0.01)
 
 
-def test_report(scene: Scene) -> None:
+def test_report_of_a_run_has_its_counts_scores_stages_and_choices(scene: Scene) -> None:
     result = scenes.compacted(scene)
     report = result.report
     assert report.num_input == 3 * 32 * 24
@@ -48,7 +48,6 @@ def test_the_input_is_scored_as_its_file_has_it(scene: Scene) -> None:
     assert before.psnr_before == pytest.approx(scenes.psnr_of(some.file_gaussians, scene), abs=0.1)
     assert before.psnr_before < scenes.psnr_of(scene.gaussians, scene) - 3
     assert before.psnr_after > before.psnr_before
-    assert before.covered is not None
     assert before.covered.share == pytest.approx(some.covered.mean(), abs=0.02)
     images = scenes.images_of(some.file_gaussians, some.cameras)[0].clip(0, 1)
     inside = -10 * elementary.log10(np.square(images - some.images)[some.covered].mean())
@@ -62,7 +61,6 @@ def test_a_result_that_loses_what_the_input_covers_is_worse(scene: Scene) -> Non
     missing = np.zeros_like(scene.pixels.shown)
     missing[:, 6:18, 8:24] = True
     report = scenes.compacted(replace(scene, filled=missing.reshape(-1)), fit="none", budget=40).report
-    assert report.covered is not None
     assert report.psnr_after > report.psnr_before
     assert report.covered.after < report.covered.before - 1
     assert report.worse is not None
@@ -122,7 +120,6 @@ def test_without_photos_colours_of_pixels_are_what_a_result_is_fitted_to_and_mea
     assert report.psnr_before == pytest.approx(scenes.psnr_of(scene.gaussians, pictures), abs=0.1)
     assert report.psnr_after == pytest.approx(scenes.psnr_of(without.gaussians, pictures), abs=0.1)
     assert scenes.psnr_of(without.gaussians, scene) > scenes.psnr_of(with_photos.gaussians, scene) - 1
-    assert report.worse is not None  # so few Gaussians show the pixels' own colours worse than they do themselves
     assert report.worse.startswith(f"the result shows {ROW_COLORS} worse than the input does: ")
 
 
@@ -136,17 +133,17 @@ def test_count_is_what_was_asked_for(scene: Scene, match: str, k: int) -> None:
 
 
 @pytest.mark.parametrize("superpixels", [1, 2, 768])
-def test_extreme_numbers_of_superpixels(scene: Scene, superpixels: int) -> None:
+def test_extreme_numbers_of_superpixels_bound_the_count(scene: Scene, superpixels: int) -> None:
     assert len(scenes.compacted(scene, superpixels=superpixels, fit_steps=12).gaussians) <= 3 * superpixels
 
 
 @pytest.mark.parametrize(("views", "size"), [(1, (1, 1)), (3, (1, 1)), (3, (7, 5)), (1, (40, 1)), (3, (1, 40))])
-def test_tiny_images(size: tuple[int, int], views: int) -> None:
+def test_tiny_images_are_compacted(size: tuple[int, int], views: int) -> None:
     scenes.compacted(scenes.make_scene(scenes.wall(), scenes.arc(views, *size)), fit_steps=60)
 
 
 @pytest.mark.parametrize("segmentation", SEGMENTATIONS)
-def test_every_segmentation(scene: Scene, segmentation: str) -> None:
+def test_every_segmentation_keeps_to_the_count_asked_for(scene: Scene, segmentation: str) -> None:
     assert len(scenes.compacted(scene, segmentation=segmentation, superpixels=40, **UNFITTED).gaussians) <= 120
 
 
@@ -184,7 +181,7 @@ def test_tensors_give_tensors_of_the_same_values(scene: Scene, photos: bool, tor
     assert actual.report.psnr_after == expected.report.psnr_after
 
 
-def test_double_precision_input(scene: Scene) -> None:
+def test_double_precision_input_gives_nearly_the_same_result(scene: Scene) -> None:
     columns = {name: getattr(scene.gaussians, name).astype(np.float64) for name in scenes.FIELDS}
     doubled = replace(scene, gaussians=replace(scene.gaussians, **columns), images=scene.images.astype(np.float64))
     actual = [scenes.compacted(s, fit="none").gaussians for s in (doubled, scene)]

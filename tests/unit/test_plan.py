@@ -27,6 +27,7 @@ from gsmerge.plan import (
     LEVEL_SHARE,
     Plan,
     choose_networks,
+    is_without_views,
     make_plan,
     plan_scene,
     resolve_budget,
@@ -41,6 +42,7 @@ from gsmerge.runtime.record import record_run
 from gsmerge.settings.compact import EFFORT_NAMES as NAMES
 from gsmerge.settings.fit import GROW_STEPS
 from gsmerge.special.search import MAX_BUILDS, add_target
+from gsmerge.types import NO_CAMERAS, make_scene
 
 
 @pytest.fixture(scope="module")
@@ -247,7 +249,6 @@ def test_an_input_with_holes_is_compared_where_it_has_gaussians(scene: Scene) ->
     rows = replace(rows, gaussians=rows.gaussians[np.flatnonzero(x < np.quantile(x, 0.9))])
     prepared = prepare(rows, options_of().prepare)
     plan = add_target(plan_of(rows), prepared)
-    assert plan.before is not None
     assert plan.target_psnr == plan.before.covered_psnr - FIDELITY_LOSS > plan.before.psnr
     given = prepared.frame.enter(rows.gaussians)  # without those that fill the holes
     again = score(Fitted(given, prepared.scene.cameras, None), prepared, plan)
@@ -365,3 +366,12 @@ def test_coarser_levels_are_expected_to_take_less_time(scene: Scene) -> None:
     assert last.name == "input"
     works = [part.work / builds[0].work for part in builds]
     assert works == pytest.approx([1, LEVEL_SHARE, LEVEL_SHARE**2])
+
+
+def test_a_run_without_views_is_one_without_networks_or_other_methods(scene: Scene) -> None:
+    bare = make_scene(scene.gaussians, NO_CAMERAS)
+    options = CompactOptions()
+    assert is_without_views(bare, options)
+    assert not is_without_views(bare, options.with_settings({"checkpoint": "shipped"}))
+    assert not is_without_views(bare, options.with_settings({"method": "random"}))
+    assert not is_without_views(unaligned_scenes.without_order(scene), options)

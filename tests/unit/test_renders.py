@@ -76,7 +76,6 @@ def test_what_lies_around_does_not_refuse_a_fit(scene: Scene) -> None:
     object.__setattr__(prepared, "scene_around", replace(around, images=noise))
     plan = make_plan(prepared, CompactOptions().with_settings({"budget": "4%"}))
     fitted = build(prepared, plan, 400)
-    assert fitted.report is not None
     assert fitted.report.accepted
 
 

@@ -48,7 +48,7 @@ def scene(name: str) -> dict[str, np.ndarray]:
         ("S3", 3, "S3_sh3_rgb"),
     ],
 )
-def test_renders_match(name: str, degree: int, file: str) -> None:
+def test_renders_match_those_of_gsplats_projection_in_float64(name: str, degree: int, file: str) -> None:
     data = scene(name)
     means, quats, scales, opacities, sh = (data[key] for key in ("means", "quats", "scales", "opacities", "sh"))
     gaussians = Gaussians(means, quats, scales, opacities, sh[:, :1], sh[:, 1 : (degree + 1) ** 2])

@@ -70,7 +70,6 @@ def test_a_rim_beside_what_is_shown_does_not_count_as_empty() -> None:
 def test_outside_views_stand_behind_and_around_the_cameras(outside: Outside, truth: Gaussians, photos: Pair) -> None:
     """Each looks at the middle of what its photo sees, from no nearer than the photo's camera."""
     views = outside.views
-    assert views.weights is not None
     assert views.weights.shape == (len(views), LEAST_WIDTH * photos[1].height // photos[1].width, LEAST_WIDTH)
     assert np.unique(views.weights) == pytest.approx([0, LEAST_FOG_WEIGHT, VEIL_WEIGHT * LEAST_FOG_WEIGHT])
     eyes, own = camera_centres(views.viewmats), camera_centres(photos[1].viewmats)

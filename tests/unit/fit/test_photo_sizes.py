@@ -44,36 +44,28 @@ def with_large(scene: Scene, scale: float, read: list[int] | None = None) -> Pic
 # which size
 
 
+SMALLER = "is 1.5: the photos are no larger"
+SHORT = "is 1: larger photos need the full fit, with steps on photos of full size"
+
+
 @pytest.mark.parametrize(
-    ("larger", "auto", "settings", "expected"),
+    ("larger", "auto", "settings", "expected", "reason"),
     [
-        (4, True, {}, 2), (1.5, True, {}, 1.5), (1.2, True, {}, 1), (4, False, {}, 1), (4, True, {"fit": "none"}, 1),
-        (4, True, {"fit_steps": 12}, 1), (4, True, {"photo_scale": 1}, 1), (4, True, {"photo_scale": 3}, 3),
-        (4, False, {"photo_scale": 1.5}, 1.5), (1.2, True, {"photo_scale": 1.1}, 1.1),
+        (4, True, {}, 2, None), (1.5, True, {}, 1.5, None), (1.2, True, {}, 1, None), (4, False, {}, 1, None),
+        (4, True, {"fit": "none"}, 1, None), (4, True, {"fit_steps": 12}, 1, None),
+        (4, True, {"photo_scale": 1}, 1, None), (4, True, {"photo_scale": 3}, 3, None),
+        (4, False, {"photo_scale": 1.5}, 1.5, None), (1.2, True, {"photo_scale": 1.1}, 1.1, None),
+        (1.5, True, {"photo_scale": 4}, 1.5, f"photo_scale 4 {SMALLER}"),
+        (2, True, {"photo_scale": 2, "fit": "none"}, 1, f"photo_scale 2 {SHORT}"),
+        (2, True, {"photo_scale": 2, "fit_steps": 12}, 1, f"photo_scale 2 {SHORT}"),
     ],
 )  # fmt: skip
-def test_the_photo_scale_is_chosen_by_photos_and_settings(
-    scene: Scene, larger: float, auto: bool, settings: dict[str, Any], expected: float
+def test_the_photo_scale_is_that_of_photos_and_settings_or_smaller_for_a_reason(
+    scene: Scene, larger: float, auto: bool, settings: dict[str, Any], expected: float, reason: str | None
 ) -> None:
     actual, problem = photo_scale(with_large(scene, larger), FitOptions(**settings), auto=auto)
     assert actual == pytest.approx(expected, rel=0.02)
-    assert problem is None
-
-
-@pytest.mark.parametrize(
-    ("larger", "settings", "expected", "reason"),
-    [
-        (1.5, {"photo_scale": 4}, 1.5, "photo_scale 4 is 1.5: the photos are no larger"),
-        (2, {"photo_scale": 2, "fit": "none"}, 1, "photo_scale 2 is 1: larger photos need the full fit"),
-        (2, {"photo_scale": 2, "fit_steps": 12}, 1, "photo_scale 2 is 1: larger photos need the full fit"),
-    ],
-)
-def test_a_smaller_photo_scale_than_asked_for_has_a_reason(
-    scene: Scene, larger: float, settings: dict[str, Any], expected: float, reason: str
-) -> None:
-    actual, problem = photo_scale(with_large(scene, larger), FitOptions(**settings), auto=True)
-    assert actual == pytest.approx(expected, rel=0.02)
-    assert problem.startswith(reason)
+    assert problem == reason
 
 
 def test_photos_of_the_size_of_the_views_have_scale_1(scene: Scene) -> None:

@@ -3,6 +3,7 @@ from __future__ import annotations
 import errno
 import itertools
 import os
+import re
 import stat
 import subprocess
 import sys
@@ -15,7 +16,7 @@ import pytest
 from messages import NO_FOLDER, refuses
 
 from gsmerge.errors import SceneError
-from gsmerge.io import atomic, atomic_output, atomic_outputs
+from gsmerge.io import atomic_output, atomic_outputs
 from gsmerge.io.atomic import common_mode, remove_stale, temporary_path
 
 
@@ -104,7 +105,7 @@ def test_only_temporary_files_of_dead_processes_are_removed(tmp_path: Path) -> N
         tmp_path / ".out-00112233.ply",
     ]
     elsewhere = [temporary_file_of(pid_of_ended_process(), tmp_path / name) for name in ("out.ply", "old.ply")]
-    recent, old = [path.with_name(path.name.replace(atomic._machine_hash(), "00000000")) for path in elsewhere]
+    recent, old = [path.with_name(re.sub("-[^-]+-", "-00000000-", path.name, count=1)) for path in elsewhere]
     for path in (*dead, *kept, recent, old):
         path.touch()
     os.utime(old, (0, 0))

@@ -21,8 +21,9 @@ from gsmerge.errors import SceneError
 from gsmerge.io import bounds, read_images
 from gsmerge.io import photo_files as photos
 from gsmerge.io.image_names import match_images, natural_key
-from gsmerge.io.photo_files import decode_image, image_size
+from gsmerge.io.photo_files import PhotoTransform, decode_image, image_size, resize_and_crop, resize_to
 from gsmerge.runtime.threads import use_threads
+from gsmerge.types import Cameras
 
 
 def touch(folder: Path, *names: str) -> Path:
@@ -154,8 +155,6 @@ def test_natural_key_counts_any_number_of_digits() -> None:
 
 
 PICTURE = np.random.default_rng(0).integers(0, 255, (20, 30, 3), np.uint8)
-
-
 DATA = cv2.imencode(".png", PICTURE[..., ::-1])[1].tobytes()
 
 
@@ -317,3 +316,16 @@ def test_a_photo_of_more_pixels_than_its_bytes_allow_is_refused(
         image_size(path)
     path.write_bytes(path.read_bytes() + bytes(side * side // 8))  # as an ordinary photo of 24 megapixels and 3 MB
     assert image_size(path) == (side, side)
+
+
+@pytest.mark.parametrize("mapping", [resize_to((100, 60), (50, 24)), resize_and_crop((100, 60), (30, 30))])
+def test_photo_transforms_move_a_camera_as_they_move_its_photo(mapping: PhotoTransform) -> None:
+    photo = np.zeros((60, 100, 3), np.uint8)
+    photo[24:36, 64:72] = 255
+    (small,) = mapping.photos([photo])
+    assert small.shape == (mapping.height, mapping.width, 3)
+    y, x = (np.average(np.arange(n) + 0.5, weights=small[..., 0].sum(axis)) for n, axis in
+            ((mapping.height, 1), (mapping.width, 0)))  # fmt: skip
+    K = np.array([[[1.0, 0, 68], [0, 1, 30], [0, 0, 1]]], np.float64)
+    (moved,) = mapping.cameras(Cameras(np.eye(4)[None], K, 100, 60)).Ks
+    assert (x, y) == pytest.approx((float(moved[0, 2]), float(moved[1, 2])), abs=0.1)

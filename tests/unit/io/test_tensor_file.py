@@ -52,18 +52,17 @@ def test_a_tensor_file_that_shrinks_while_it_is_read_is_refused(path: Path, monk
         read_tensors(path, "a file", REMEDY)
 
 
-def test_types_that_numpy_lacks_are_refused(tmp_path: Path) -> None:
-    path = tmp_path / "a.gsm"
-    head = json.dumps({"a": {"dtype": "BF16", "shape": [1], "data_offsets": [0, 2]}}).encode()
-    path.write_bytes(len(head).to_bytes(8, "little") + head + bytes(2))
-    with refuses(SceneError, path, "BF16"):
-        read_tensors(path, "a file", REMEDY)
-
-
-def test_more_arrays_than_a_file_may_have_are_refused(tmp_path: Path) -> None:
-    """Each of 55 bytes, of which the reader would make 1.7 kB."""
-    path = tmp_path / "a.gsm"
-    head = json.dumps({f"{i}": {"dtype": "U8", "shape": [0], "data_offsets": [0, 0]} for i in range(100_000)}).encode()
-    path.write_bytes(len(head).to_bytes(8, "little") + head)
-    with refuses(SceneError, path, "arrays"):
+@pytest.mark.parametrize(
+    ("head", "found"),
+    [
+        ({"a": {"dtype": "BF16", "shape": [1], "data_offsets": [0, 2]}}, "BF16"),
+        # Each of 55 bytes, of which the reader would make 1.7 kB
+        ({f"{i}": {"dtype": "U8", "shape": [0], "data_offsets": [0, 0]} for i in range(100_000)}, "arrays"),
+    ],
+    ids=["a type that NumPy lacks", "more arrays than a file may have"],
+)
+def test_headers_that_are_not_read_are_refused(head: dict[str, object], found: str, tmp_path: Path) -> None:
+    path, text = tmp_path / "a.gsm", json.dumps(head).encode()
+    path.write_bytes(len(text).to_bytes(8, "little") + text + bytes(2))
+    with refuses(SceneError, path, found):
         read_tensors(path, "a file", REMEDY)

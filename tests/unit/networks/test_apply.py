@@ -47,6 +47,12 @@ def pairs(features: FeatureGaussians) -> Matches:
     return Matches(clusters, half + 1)
 
 
+def encode_noisily(scene: Made) -> tuple[NetworkContext, FeatureGaussians]:
+    """Return networks with weights at random, and the features that they encode."""
+    context = scene.networks(noisy())
+    return context, encode_features(scene.features, context)
+
+
 def test_untrained_networks_change_no_bit(scene: Made) -> None:
     context = scene.networks(untrained(SMALL))
     encoded = encode_features(scene.features, context)
@@ -63,8 +69,7 @@ def test_untrained_networks_change_no_bit(scene: Made) -> None:
 
 
 def test_trained_networks_change_every_stage(scene: Made) -> None:
-    context = scene.networks(noisy())
-    encoded = encode_features(scene.features, context)
+    context, encoded = encode_noisily(scene)
     assert not np.array_equal(encoded.means, scene.features.means)
     assert np.array_equal(encoded.covars, scene.features.covars)  # paper: the encoder leaves the geometry to the head
     merged, plain = merge(encoded, pairs(encoded), context), merge(encoded, pairs(encoded))
@@ -109,8 +114,7 @@ def test_each_group_is_encoded_as_if_alone(scene: Made) -> None:
 
 
 def test_merged_cluster_does_not_depend_on_the_order_of_members(scene: Made) -> None:
-    context = scene.networks(noisy())
-    encoded = encode_features(scene.features, context)
+    context, encoded = encode_noisily(scene)
     matches = pairs(encoded)
     back = np.arange(len(encoded))[::-1].copy()
     a = merge(encoded, matches, context)
@@ -121,8 +125,7 @@ def test_merged_cluster_does_not_depend_on_the_order_of_members(scene: Made) -> 
 
 def test_three_children_take_slots_of_the_head_for_four(scene: Made) -> None:
     """Slots that are empty do not count, whoever shares the table."""
-    context = scene.networks(noisy())
-    encoded = encode_features(scene.features, context)
+    context, encoded = encode_noisily(scene)
     counts = np.where(np.arange(len(encoded)) % 2 == 0, 3, 4)
     options = DecodeOptions(min_opacity=0)
     mixed_counts = decode(encoded, scene.members, options, counts, networks=context)
@@ -137,8 +140,7 @@ def test_three_children_take_slots_of_the_head_for_four(scene: Made) -> None:
 
 def test_many_children_are_corrected_in_halves(scene: Made) -> None:
     """Six like three and three of groups of their own."""
-    context = scene.networks(noisy())
-    encoded = encode_features(scene.features, context)
+    context, encoded = encode_noisily(scene)
     large = np.flatnonzero(np.diff(encoded.starts) >= 30)
     few = take_features(encoded, large)
     children, parents = divide_groups(few, scene.members, np.full(len(few), 6))
@@ -150,8 +152,7 @@ def test_many_children_are_corrected_in_halves(scene: Made) -> None:
 
 
 def test_refiner_reads_near_neighbours_alone(scene: Made) -> None:
-    context = scene.networks(noisy())
-    encoded = encode_features(scene.features, context)
+    context, encoded = encode_noisily(scene)
     near = find_neighbors(encoded.means, 4)
     far = int(np.setdiff1d(np.arange(len(encoded)), np.append(near[0], 0))[-1])
     for row, same in ((int(near[0, 0]), False), (far, True)):

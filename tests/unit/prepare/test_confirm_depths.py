@@ -1,4 +1,4 @@
-"""The views of a scene confirm or contradict each other's depth."""
+"""The views of a scene confirm or contradict each other's depth, which sets the share of superpixels."""
 
 from __future__ import annotations
 
@@ -11,8 +11,11 @@ import scenes
 import unaligned_scenes
 from motions import with_nearer_half
 
+import gsmerge
 from gsmerge import Cameras, Scene
+from gsmerge.geometry.pooling import scene_members
 from gsmerge.kernels.elementary import log
+from gsmerge.plan import make_plan
 from gsmerge.prepare.confirm_depths import (
     AGREEMENT_PIXELS,
     AGREEMENT_SHARE,
@@ -22,6 +25,11 @@ from gsmerge.prepare.confirm_depths import (
     Agreement,
     confirm_depths,
 )
+from gsmerge.prepare.prepare_scene import prepare
+from gsmerge.runtime.record import record_run
+from gsmerge.settings.compact import CompactOptions
+from gsmerge.stages.encode import encode, weaken_contradicted
+from gsmerge.types import Groups
 
 VIEWS, WIDTH, HEIGHT = 4, 48, 36
 
@@ -131,7 +139,6 @@ def test_the_part_of_the_views_that_is_contradicted_most_is_named(wall: Scene) -
     assert confirm_depths(turned_away(wall, 2)).alone_part == ""
     assert confirm_depths(wall).contradicted_part == ""
     wrong = replace(agreement, confirmed=0.4).advice
-    assert wrong is not None
     assert "the depth is wrong (right third of 2 of 4 views)" in wrong
 
 
@@ -145,9 +152,7 @@ def test_the_share_of_gaussians_falls_with_the_confirmed_share() -> None:
 def test_advice_on_a_poor_scene_says_why_it_is_poor() -> None:
     assert Agreement(0.5, 0.5, 0.0).advice is None
     lonely, wrong = Agreement(0.24, 0.14, 0.34).advice, Agreement(0.34, 0.41, 0.07).advice
-    assert lonely is not None
     assert all(word in lonely for word in ("24 %", "34 %", "too few or too far apart"))
-    assert wrong is not None
     assert all(word in wrong for word in ("34 %", "depth is wrong"))
 
 
@@ -158,25 +163,95 @@ def test_advice_on_photos_from_one_point_names_a_panorama(wall: Scene) -> None:
     turned = cameras.viewmats.copy()
     turned[:, :3, 3] = -turned[:, :3, :3] @ centre
     agreement = confirm_depths(replace(wall, cameras=replace(cameras, viewmats=turned)))
-    assert agreement is not None
     assert agreement.from_one_point
-    assert agreement.advice is not None
     assert "panorama" in agreement.advice
     whole = confirm_depths(wall)
-    assert whole is not None
     assert not whole.from_one_point
 
 
 def test_pixels_beyond_a_crop_contradict_nothing(wall: Scene) -> None:
     """Pixels without a Gaussian say nothing, and few pixels too little."""
     whole, pixels = confirm_depths(wall), wall.get_pixels()
-    assert whole is not None
     middle = np.linalg.norm(wall.gaussians.means - wall.gaussians.means.mean(0), axis=1)
     for share in (0.2, 0.02):
         inside = middle < np.quantile(middle, share)
         cropped = replace(wall, pixels=replace(pixels, fronts=np.where(inside[pixels.fronts], pixels.fronts, -1)))
         agreement = confirm_depths(cropped)
-        assert agreement is not None
         assert agreement.confirmed > whole.confirmed - 0.1
         assert agreement.advice is None
     assert Agreement(0.1, 0.1, 0.0, num_pixels=8).advice is None
+
+
+AUTO = CompactOptions().with_settings({"superpixels": "auto"})
+
+
+@pytest.fixture(scope="module")
+def flat() -> Scene:
+    return scenes.make_scene(scenes.wall(), scenes.arc(4, 48, 36))
+
+
+def test_what_other_views_see_through_begins_fainter(flat: Scene) -> None:
+    """One view's right half stands nearer than the flat that all others see; the flat itself stays as it is."""
+    wrong = with_nearer_half(flat, [1])
+    labels = np.arange(48 * 36, dtype=np.int32).reshape(36, 48) // 6
+    groups = Groups(np.broadcast_to(labels, (4, 36, 48)).copy(), (288,) * 4)
+    features = encode(wrong, scene_members(wrong), groups)
+    thin = weaken_contradicted(features, scene_members(wrong), wrong.cameras)
+    moved = (features.views == 1) & (np.arange(len(features)) % 8 >= 4)
+    factors = thin.gains / features.gains
+    assert set(np.unique(factors.round(2))) <= {np.float32(0.15), np.float32(0.39), np.float32(1)}
+    assert (factors[moved] < 1).mean() > 0.9
+    assert (factors[~moved] == 1).mean() > 0.95
+    np.testing.assert_array_equal(thin.means, features.means)
+
+
+def test_views_that_agree_get_more_superpixels(flat: Scene) -> None:
+    shares = []
+    for scene in (flat, with_nearer_half(flat, [1]), with_nearer_half(flat, [0, 2])):
+        with record_run() as log:
+            plan = make_plan(prepare(scene), AUTO)
+        shares.append(plan.superpixels.options.share)
+        agreement = confirm_depths(scene)
+        assert log.choices["agreement"] == agreement.to_dict()
+        assert shares[-1] == pytest.approx(agreement.share, rel=0.05)
+        assert len(log.notes) == 1
+        assert f"other views confirm {100 * agreement.confirmed:.0f} %" in log.notes[0]
+    assert shares[0] == shares[1] == MOST_PER_PIXEL  # an eighth of the pixels is contradicted, then a quarter
+    assert FEWEST <= shares[2] < MOST_PER_PIXEL
+
+
+@pytest.mark.slow
+def test_an_automatic_budget_is_the_share_that_the_depths_bear(flat: Scene) -> None:
+    auto = CompactOptions().with_settings({"budget": "auto"})
+    for scene in (flat, with_nearer_half(flat, [0, 2])):
+        with record_run() as log:
+            plan = make_plan(prepare(scene), auto)
+        assert plan.limits.count == pytest.approx(confirm_depths(scene).share * len(scene.gaussians), rel=0.05)
+        assert any(note.startswith("budget: ") and "confirm" in note for note in log.notes)
+        assert not plan.auto_count
+        assert plan.settings["budget"] == "auto"
+    without_fit = make_plan(prepare(flat), auto.with_settings({"fit": "none"}))
+    lone = make_plan(prepare(scenes.take_views(flat, [0])), auto)
+    assert without_fit.auto_count
+    assert lone.auto_count  # the curve decides: nothing can be compared
+
+
+def test_scenes_whose_depths_cannot_be_compared_get_the_usual_share(flat: Scene) -> None:
+    room = scenes.make_scene(scenes.room(), scenes.arc(4, 48, 36))
+    for scene in (scenes.take_views(flat, [0]), unaligned_scenes.without_order(room)):
+        with record_run() as log:
+            assert make_plan(prepare(scene), AUTO).superpixels.options.share == CompactOptions().segment.share
+        assert "compared" in log.notes[0]
+        assert "agreement" not in log.choices
+
+
+def test_run_reports_the_budget_it_chose(flat: Scene) -> None:
+    auto, usual = (
+        scenes.compacted(flat, superpixels=share, effort="draft", fit_steps=10, poses="fixed")
+        for share in ("auto", "4.4%")
+    )
+    assert len(auto.gaussians) > 1.4 * len(usual.gaussians)
+    assert auto.report.options["superpixels"] == "auto"
+    assert any(note.startswith("superpixels: ") for note in auto.report.notes)
+    with pytest.raises(ValueError, match="superpixels"):
+        gsmerge.compact(flat, superpixels="some")

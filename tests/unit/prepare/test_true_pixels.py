@@ -15,6 +15,7 @@ from gsmerge.geometry.transforms import camera_depths
 from gsmerge.kernels import elementary
 from gsmerge.prepare.true_pixels import HIDDEN_SIZE, LOW_PASS, choose_level, find_pixels, raise_sizes, with_pixels
 from gsmerge.runtime.record import record_run
+from gsmerge.types import NO_CAMERAS
 
 WIDTH, HEIGHT = 96, 72
 
@@ -142,7 +143,7 @@ def test_tiny_gaussians_are_merged_as_well_as_sound_ones(kind: str, factor: floa
     """The input is drawn well by the low-pass alone, and the result is about as good as that of sound Gaussians."""
     sound = scenes.make_scene(scenes.room(), scenes.arc(3, 48, 36), noise=0.03)
     if kind != "grid":
-        cameras = {"cameras": unaligned_scenes.NO_CAMERAS, "images": None, "names": ()} if kind == "no cameras" else {}
+        cameras = {"cameras": NO_CAMERAS, "images": None, "names": ()} if kind == "no cameras" else {}
         sound = replace(unaligned_scenes.shuffled(sound), **cameras)
     scene = replace(sound, gaussians=resized(sound.gaussians, factor))
     settings = {"budget": 600, "fit_steps": 60, "checkpoint": "none"} | (

@@ -18,7 +18,7 @@ PHOTO = np.clip(RNG.normal(0.5, 0.2, (40, 50, 3)), 0, 1).astype(np.float32)
 NOISY = np.clip(PHOTO + RNG.normal(0, 0.1, PHOTO.shape), 0, 1).astype(np.float32)
 
 
-def test_psnr_of_a_known_error() -> None:
+def test_psnr_of_a_known_error_is_as_by_hand() -> None:
     assert psnr(np.full((4, 4, 3), 0.6), np.full((4, 4, 3), 0.5)) == pytest.approx(20)
 
 
@@ -63,7 +63,7 @@ def test_ssim_matches_scikit_image_s_where_images_are_smooth(noise: float) -> No
     assert ssim(smooth, noisy) == pytest.approx(reference_ssim(smooth, noisy), abs=1e-5)
 
 
-def test_ssim_of_the_smallest_image() -> None:
+def test_ssim_of_the_smallest_image_is_that_of_one_window() -> None:
     first, second = PHOTO[:11, :11], NOISY[:11, :11]
     assert ssim(first, second) == pytest.approx(reference_ssim(first, second), abs=1e-5)
 

@@ -18,13 +18,19 @@ from gsmerge.errors import SceneError
 from gsmerge.geometry.transforms import fit_similarity
 from gsmerge.reading import larger_photos as scene_views
 from gsmerge.reading.held_out import read_held_out
-from gsmerge.reading.read_scene import load_scene
+from gsmerge.reading.read_scene import Loaded, load_scene
 from gsmerge.types import Scene
 
 
 @pytest.fixture(scope="module")
 def tiny() -> Tiny:
     return make_tiny(32, 24)
+
+
+@pytest.fixture(scope="module")
+def load(tmp_path_factory: pytest.TempPathFactory) -> Loaded:
+    """Return the tiny scene, read. Read only."""
+    return load_scene(make_tiny(32, 24).save(tmp_path_factory.mktemp("held-out") / "scene"))
 
 
 def write_views(folder: Path, poses: dict[str, np.ndarray], tiny: Tiny, size: tuple[int, int] = (32, 24)) -> Path:
@@ -53,8 +59,7 @@ def stems(tiny: Tiny) -> list[str]:
     return [Path(name).stem for name in tiny.names]
 
 
-def test_targets_are_the_other_views_of_the_file_in_its_order(tiny: Tiny, tmp_path: Path) -> None:
-    load = load_scene(tiny.save(tmp_path / "scene"))
+def test_targets_are_the_other_views_of_the_file_in_its_order(tiny: Tiny, load: Loaded, tmp_path: Path) -> None:
     a, b, c = stems(tiny)
     poses = {a: tiny.c2w[0], "held": between(tiny), b: tiny.c2w[1], c: tiny.c2w[2]}
     targets = read_held_out(load, write_views(tmp_path / "all", poses, tiny))
@@ -64,8 +69,7 @@ def test_targets_are_the_other_views_of_the_file_in_its_order(tiny: Tiny, tmp_pa
     assert np.allclose(targets.images[0], 10 / 255)
 
 
-def test_a_world_of_its_own_is_brought_to_the_scene_s(tiny: Tiny, tmp_path: Path) -> None:
-    load = load_scene(tiny.save(tmp_path / "scene"))
+def test_a_world_of_its_own_is_brought_to_the_scene_s(tiny: Tiny, load: Loaded, tmp_path: Path) -> None:
     turn, factor, shift = rotation(0.4, -1.0, 0.3), 7.5, np.array([10.0, -4.0, 2.0])
 
     def elsewhere(pose: np.ndarray) -> np.ndarray:
@@ -80,8 +84,7 @@ def test_a_world_of_its_own_is_brought_to_the_scene_s(tiny: Tiny, tmp_path: Path
     assert np.allclose(np.linalg.inv(targets.cameras.viewmats[0]), between(tiny), atol=1e-6)
 
 
-def test_equal_names_of_other_views_mean_nothing(tiny: Tiny, tmp_path: Path) -> None:
-    load = load_scene(tiny.save(tmp_path / "scene"))
+def test_equal_names_of_other_views_mean_nothing(tiny: Tiny, load: Loaded, tmp_path: Path) -> None:
     targets = read_held_out(load, write_views(tmp_path / "held", {stems(tiny)[0]: between(tiny)}, tiny))
     assert len(targets) == 1
     assert targets.context_places is None
@@ -113,23 +116,22 @@ def assert_between(viewmat: np.ndarray, tiny: Tiny) -> None:
     assert np.allclose(np.linalg.inv(viewmat), between(tiny), atol=1e-6)
 
 
-def test_views_of_other_names_that_stand_in_the_same_place_are_no_targets(tiny: Tiny, tmp_path: Path) -> None:
-    load = load_scene(tiny.save(tmp_path / "scene"))
+def test_views_of_other_names_that_stand_in_the_same_place_are_no_targets(
+    tiny: Tiny, load: Loaded, tmp_path: Path
+) -> None:
     poses = {"p": tiny.c2w[0], "q": between(tiny), "r": tiny.c2w[1]}
     assert read_held_out(load, write_views(tmp_path / "all", poses, tiny)).names == ("images/q.png",)
     with refuses(SceneError, "transforms.json", "held-out views", "only views"):
         read_held_out(load, write_views(tmp_path / "none", {"p": tiny.c2w[0]}, tiny))
 
 
-def test_photos_of_another_size_bring_their_intrinsics(tiny: Tiny, tmp_path: Path) -> None:
-    load = load_scene(tiny.save(tmp_path / "scene"))
+def test_photos_of_another_size_bring_their_intrinsics(tiny: Tiny, load: Loaded, tmp_path: Path) -> None:
     targets = read_held_out(load, write_views(tmp_path / "held", {"q": between(tiny)}, tiny, (64, 48)))
     assert tuple(targets.images.shape) == (1, 48, 64, 3)
     assert np.allclose(targets.cameras.Ks[0][:2], 2 * tiny.K[:2])
 
 
-def test_photos_of_targets_elsewhere_have_to_be_named(tiny: Tiny, tmp_path: Path) -> None:
-    load = load_scene(tiny.save(tmp_path / "scene"))
+def test_photos_of_targets_elsewhere_have_to_be_named(tiny: Tiny, load: Loaded, tmp_path: Path) -> None:
     cameras = write_views(tmp_path / "held", {"q": between(tiny)}, tiny)
     shutil.move(str(tmp_path / "held" / "images"), str(tmp_path / "photos"))
     with pytest.raises(SceneError, match="--target-images"):
@@ -139,16 +141,14 @@ def test_photos_of_targets_elsewhere_have_to_be_named(tiny: Tiny, tmp_path: Path
         read_held_out(load, cameras, tmp_path / "nowhere")
 
 
-def test_the_photo_that_is_missing_is_named(tiny: Tiny, tmp_path: Path) -> None:
-    load = load_scene(tiny.save(tmp_path / "scene"))
+def test_the_photo_that_is_missing_is_named(tiny: Tiny, load: Loaded, tmp_path: Path) -> None:
     path = write_views(tmp_path / "held", {"q": between(tiny), "r": between(tiny)}, tiny)
     (path.parent / "images" / "r.png").unlink()
     with refuses(SceneError, "transforms.json", "images/r.png", "--target-images"):
         read_held_out(load, path)
 
 
-def test_targets_of_a_scene_without_views(tiny: Tiny, tmp_path: Path) -> None:
-    load = load_scene(tiny.save(tmp_path / "scene"))
+def test_targets_of_a_scene_without_views_share_no_place_with_it(tiny: Tiny, load: Loaded, tmp_path: Path) -> None:
     bare = replace(load, scene=Scene(load.scene.gaussians, load.scene.cameras[[]], None, None, ()))
     targets = read_held_out(bare, write_views(tmp_path / "held", {"q": between(tiny)}, tiny))
     assert (len(targets), targets.context_places) == (1, None)
@@ -177,8 +177,9 @@ def test_view_beside_a_single_input_view_is_a_target_in_any_unit(factor: float, 
     assert targets.names == ("images/q.png",)
 
 
-def test_photos_beyond_all_memory_are_made_smaller(tiny: Tiny, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    load = load_scene(tiny.save(tmp_path / "scene"))
+def test_photos_beyond_all_memory_are_made_smaller(
+    tiny: Tiny, load: Loaded, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     cameras = write_views(tmp_path / "held", {"q": between(tiny)}, tiny, (1600, 1200))
     assert read_held_out(load, cameras).images.shape[2] == 1600
     monkeypatch.setattr(scene_views, "_MAX_BYTES", 1 << 20)

@@ -14,6 +14,7 @@ from messages import names
 from PIL import Image
 from plyfile import PlyData, PlyElement
 from shared import write_scene
+from sweeps import sweep
 
 from gsmerge.errors import SceneError
 from gsmerge.reading.read_scene import Loaded, load_scene
@@ -41,7 +42,6 @@ def truth(tmp_path_factory: pytest.TempPathFactory) -> np.ndarray:
 
 def read(path: Path) -> np.ndarray:
     image = cv2.imread(str(path))
-    assert image is not None
     return image[..., ::-1].astype(np.float32) / 255
 
 
@@ -121,7 +121,7 @@ def test_a_photo_without_a_camera_is_named(folder: Path, truth: np.ndarray) -> N
     assert not any("no camera" in text for text in load_scene(folder).notes)
 
 
-def test_a_photo_of_something_else_has_a_camera(folder: Path) -> None:
+def test_a_photo_of_something_else_is_left_out_with_its_view_in_one_note(folder: Path) -> None:
     """One note says so; none that its camera is missing."""
     other = photos_in(folder)[0]
     stripes = np.zeros_like((read(other) * 255).astype(np.uint8))
@@ -132,7 +132,7 @@ def test_a_photo_of_something_else_has_a_camera(folder: Path) -> None:
     assert not any("no camera" in text for text in notes)
 
 
-def test_a_photo_in_a_format_that_is_not_read(folder: Path) -> None:
+def test_a_photo_with_the_ending_of_a_format_that_is_not_read_is_a_doubt(folder: Path) -> None:
     path = photos_in(folder)[1]
     path.rename(path.with_suffix(".HEIC"))
     assert names(str(load_scene(folder).doubts), path.name, path.with_suffix(".HEIC").name, "convert")
@@ -146,7 +146,7 @@ def test_a_photo_in_a_format_that_is_not_read(folder: Path) -> None:
         (b"#?RADIANCE\n", "Radiance"), (b"8BPS\0\1", "Photoshop"), (b"FUJIFILMCCD-RAW 0201", "raw"),
     ],
 )  # fmt: skip
-def test_a_photo_whose_content_is_in_a_format_that_is_not_read(folder: Path, start: bytes, name: str) -> None:
+def test_a_photo_with_content_in_a_format_that_is_not_read_is_a_doubt(folder: Path, start: bytes, name: str) -> None:
     """Whatever its ending says; the note says how to go on."""
     path = photos_in(folder)[1]
     path.write_bytes(start.ljust(4096, b"\x80"))
@@ -185,7 +185,7 @@ def test_photo_of_another_shape_is_used_if_its_camera_has_its_shape(
     assert not any("no camera" in note for note in loaded.notes)
 
 
-def test_a_photo_of_another_shape_than_its_camera(folder: Path, truth: np.ndarray) -> None:
+def test_a_photo_of_another_shape_than_its_camera_is_left_out_alone(folder: Path, truth: np.ndarray) -> None:
     """Only the photo is left out: the view keeps its camera, and all rows their pixels."""
     path = photos_in(folder)[1]
     Image.fromarray((read(path) * 255).astype(np.uint8)).resize((100, 100)).save(path)
@@ -197,7 +197,7 @@ def test_a_photo_of_another_shape_than_its_camera(folder: Path, truth: np.ndarra
     assert names(str(loaded.doubts), "photos of 1 of 4 views", path.name, "100 x 100", "192 x 144")
 
 
-def test_photos_that_no_camera_names_beside_rows_of_nothing(folder: Path) -> None:
+def test_photos_that_no_camera_names_beside_rows_of_nothing_are_refused(folder: Path) -> None:
     """Are refused with the reason why the cameras are."""
     name_frames(folder, lambda view, name: f"elsewhere/{view}.png")
     photos_in(folder)[0].unlink()
@@ -209,7 +209,7 @@ def test_photos_that_no_camera_names_beside_rows_of_nothing(folder: Path) -> Non
         load_scene(folder, cameras=folder / "transforms.json", images=folder / "images")
 
 
-@pytest.mark.parametrize("view", [0, 2, 3])
+@sweep("view", [0, 2, 3])
 def test_views_without_gaussians_are_not_there_where_cameras_are_estimated(
     folder: Path, truth: np.ndarray, view: int
 ) -> None:

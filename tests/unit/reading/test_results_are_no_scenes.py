@@ -6,11 +6,13 @@ import shutil
 from pathlib import Path
 
 import pytest
+from damage import SOUNDS
 from exports import export_rows, save_export
 from messages import noted, refuses
 from plyfile import PlyData
 from tiny_scene import Tiny, make_tiny, write_inria
 
+from gsmerge import Compactor, read_scene
 from gsmerge.cli import main
 from gsmerge.errors import SceneError
 from gsmerge.io import read_ply, write_gaussians, write_ply
@@ -98,7 +100,7 @@ def test_single_result_of_a_folder_is_taken_and_several_are_refused(folder: Path
         find_scene_files(folder)
 
 
-def test_cameras_of_a_result_with_the_scene_s_name(folder: Path, tiny: Tiny) -> None:
+def test_cameras_of_a_result_with_the_name_of_the_scene_stay_the_results(folder: Path, tiny: Tiny) -> None:
     """The scene keeps its own cameras, and without them gets none; results have theirs."""
     write_inria(cameras := folder / "room.cameras.json", tiny)
     assert find_scene_files(folder / "room.ply").cameras == folder / "transforms.json"  # the result may be elsewhere
@@ -131,3 +133,10 @@ def test_headers_of_many_files_are_read_up_to_a_bound(
     monkeypatch.setattr("gsmerge.reading.scene_files._MAX_HEADERS", 1)
     with refuses(SceneError, folder, "2 (room.ply, z.ply)"):
         find_scene_files(folder)
+
+
+def test_feature_gaussians_are_no_scene(tmp_path: Path) -> None:
+    results, features = (SOUNDS[kind].put(tmp_path / kind) for kind in ("gsm", "gsm of features"))
+    assert read_scene(results).num_gaussians == len(Compactor.load(results))
+    with pytest.raises(SceneError, match="Feature Gaussians"):
+        read_scene(features)

@@ -14,7 +14,6 @@ from messages import noted, refuses
 from tiny_scene import Tiny, edited_json, frames_of, write_colmap_binary, write_images, write_npz, write_transforms
 
 from gsmerge.errors import SceneError
-from gsmerge.reading import take_gaussians as rows
 from gsmerge.reading.read_scene import load_scene, read_scene
 from gsmerge.reading.scene_files import scene_title
 
@@ -167,16 +166,6 @@ def test_cameras_of_another_scene_are_refused_with_what_was_measured(tiny_folder
     write_transforms(tiny_folder / "transforms.json", replace(tiny, c2w=strange))
     with refuses(SceneError, "transforms.json", "median", "1.5 px", "convention"):
         read_scene(tiny_folder, order="view-major", cameras=tiny_folder)
-
-
-def test_order_of_rows_is_checked_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rows, "_BLOCK", 4)
-    ids = np.arange(11, dtype=np.int32)
-    assert rows._counts_up(ids)
-    for wrong in (0, 4, 10):
-        changed = ids.copy()
-        changed[wrong] += 1
-        assert not rows._counts_up(changed)
 
 
 @pytest.mark.parametrize(

@@ -115,7 +115,7 @@ def test_cameras_that_are_named_are_refused(tmp_path: Path, kind: str) -> None:
     assert alone.files.cameras is None
 
 
-def test_photos_of_something_else_beside_the_right_cameras(tmp_path: Path) -> None:
+def test_photos_of_something_else_beside_the_right_cameras_are_left_out(tmp_path: Path) -> None:
     folder = save(tmp_path, "grid")
     write_transforms(folder / "transforms.json", SMOOTH)
     write_images(folder / "images", another())
@@ -127,7 +127,7 @@ def test_photos_of_something_else_beside_the_right_cameras(tmp_path: Path) -> No
         load_scene(folder, images=folder / "images")
 
 
-def test_photos_of_something_else_beside_a_grid(tmp_path: Path) -> None:
+def test_photos_of_something_else_beside_a_grid_are_left_out(tmp_path: Path) -> None:
     folder = save(tmp_path, "grid")
     write_images(folder / "images", another())
     assert names(str(load_scene(folder).doubts), "the photos in", folder / "images", "left out")
@@ -177,7 +177,9 @@ def test_found_masks_that_are_dark_or_damaged_are_left_out(tmp_path: Path) -> No
 
 @pytest.mark.parametrize("hints", [{"order": "view-major"}, {"order": "view-fastest"}])
 @pytest.mark.parametrize("cameras", [False, True])
-def test_hints_on_pixels_for_rows_that_have_none(cameras: bool, tmp_path: Path, hints: dict[str, str]) -> None:
+def test_hints_on_pixels_for_rows_that_have_none_are_refused(
+    cameras: bool, tmp_path: Path, hints: dict[str, str]
+) -> None:
     ((name, value),) = hints.items()
     folder = save(tmp_path / str(cameras), "voxels", cameras=cameras)
     with refuses(SceneError, "scene.ply", f"--hint {name}={value}"):

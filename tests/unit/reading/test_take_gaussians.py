@@ -38,7 +38,6 @@ def result_of(room: Scene, ids: np.ndarray | None) -> AlignmentResult:
 def test_rows_come_in_the_order_of_their_pixels(room: Scene, tmp_path: Path) -> None:
     order = np.random.default_rng(0).permutation(len(room.gaussians))[:1000]
     gaussians, pixels = take_gaussians(file_of(room.gaussians[order], tmp_path), result_of(room, order))
-    assert pixels is not None
     assert pixels.own
     assert np.array_equal(pixels.homes, np.sort(order))
     assert np.array_equal(gaussians.sh0, room.gaussians.sh0[pixels.homes])
@@ -48,9 +47,20 @@ def test_rows_come_in_the_order_of_their_pixels(room: Scene, tmp_path: Path) -> 
 def test_rows_that_are_in_the_order_of_their_pixels_are_not_copied(room: Scene, tmp_path: Path) -> None:
     file = file_of(room.gaussians[::2], tmp_path)
     gaussians, pixels = take_gaussians(file, result_of(room, np.arange(0, len(room.gaussians), 2)))
-    assert pixels is not None
     assert gaussians is file.gaussians
     assert np.array_equal(pixels.homes, np.arange(0, len(room.gaussians), 2))
+
+
+@pytest.mark.parametrize("wrong", [0, 3, 1294], ids=["first", "at the end of a block", "last"])
+def test_two_exchanged_rows_are_put_in_order(
+    wrong: int, room: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gsmerge.reading.take_gaussians._BLOCK", 4)  # numbers that are compared at once
+    order = np.arange(len(room.gaussians))
+    order[[wrong, wrong + 1]] = order[[wrong + 1, wrong]]
+    gaussians, pixels = take_gaussians(file_of(room.gaussians[order], tmp_path), result_of(room, order))
+    assert pixels.shown.all()
+    assert np.array_equal(gaussians.sh0, room.gaussians.sh0)
 
 
 def test_nearest_of_several_rows_of_a_pixel_is_in_front(room: Scene, tmp_path: Path) -> None:
@@ -60,7 +70,6 @@ def test_nearest_of_several_rows_of_a_pixel_is_in_front(room: Scene, tmp_path: P
     ids = np.concatenate([np.arange(100), np.arange(100), [-1]])
     both = Gaussians.concat([g, near, g[:1]])
     gaussians, pixels = take_gaussians(file_of(both, tmp_path), replace(result_of(room, ids), recovery=None))
-    assert pixels is not None
     assert len(gaussians) == 201
     assert (pixels.homes < 0).sum() == 1
     front = gaussians[pixels.fronts.reshape(-1)[:100]]
@@ -73,7 +82,6 @@ def test_rows_too_faint_to_be_drawn_are_left_out(room: Scene, tmp_path: Path) ->
     faint = replace(room.gaussians, opacities=opacities)
     file = file_of(faint, tmp_path)
     gaussians, pixels = take_gaussians(file, result_of(room, np.arange(len(opacities))))
-    assert pixels is not None
     assert np.array_equal(np.flatnonzero(~pixels.shown.reshape(-1)), np.arange(0, len(opacities), 7))
     assert len(gaussians) == pixels.shown.sum()
     assert len(take_gaussians(file, result_of(room, None))[0]) == len(gaussians)
@@ -93,7 +101,6 @@ def test_a_view_without_rows_keeps_its_photo(small_scene: Path, tmp_path: Path, 
     loaded = load_scene(folder)
     assert len(loaded.scene.gaussians) == 4 * one
     assert loaded.scene.photo_views == list(range(5))
-    assert loaded.scene.pixels is not None
     assert loaded.scene.pixels.shown.any((1, 2)).tolist() == [True, True, True, False, True]
     assert noted(loaded.notes, f"{one:,}")
     assert prepare(loaded.scene).reference.score_views == tuple(range(5))

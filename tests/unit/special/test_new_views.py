@@ -53,7 +53,6 @@ def test_no_gain_is_expected_where_the_trial_or_own_photos_lose() -> None:
 
 def test_a_report_of_four_views_expects_a_gain_of_new_views(room: Scene) -> None:
     report = compact(scenes.take_views(room, range(LEAST_VIEWS)), **QUICK).report
-    assert report.new_views is not None
     assert 1 <= report.new_views.views <= LEAST_VIEWS
     most = report.choices["agreement"]["confirmed"] * max(0.0, report.psnr_after - report.psnr_before)
     assert report.new_views.gain <= most + 0.01  # as rounded
@@ -79,7 +78,6 @@ def test_new_views_are_not_tried_with_too_few_photos(room: Scene) -> None:
 
 def test_the_number_of_threads_does_not_change_the_trial(room: Scene) -> None:
     one, two = (compact(room, **QUICK, threads=threads) for threads in (1, 2))
-    assert one.report.new_views is not None
     assert one.report.new_views == two.report.new_views
     assert scenes.identical(one.gaussians, two.gaussians)
 
@@ -101,7 +99,6 @@ def test_views_left_out_together_are_no_neighbours(count: int) -> None:
 def test_the_rest_has_neither_photos_nor_rows_of_left_out_views(room: Scene) -> None:
     prepared = prepare(room, PrepareOptions(poses="fixed"))
     left_out = leave_out(prepared.scene, [1, 3], prepared)
-    assert left_out is not None
     assert len(left_out.rest.scene) == 3
     assert left_out.rest.reference.score_views == (0, 1, 2)
     assert len(left_out.rows) == len(prepared.scene.gaussians) * 3 // 5

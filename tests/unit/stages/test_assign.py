@@ -24,7 +24,7 @@ from gsmerge.stages.assign import assign, find_owners, middle_pixels, owner_pixe
 from gsmerge.stages.counts import FEW_PIXELS, superpixels_per_view
 from gsmerge.stages.encode import encode, member_rows
 from gsmerge.stages.superpixels import segment
-from gsmerge.types import Groups
+from gsmerge.types import NO_CAMERAS, Groups, make_scene
 
 
 def make_room() -> Scene:
@@ -121,7 +121,7 @@ def test_few_gaussians_get_half_as_many_superpixels_at_most(room: Scene) -> None
 
 
 def test_unknown_cameras_are_placed(room: Scene) -> None:
-    blind = Scene(room.gaussians, unaligned_scenes.NO_CAMERAS, None, None, ())
+    blind = make_scene(room.gaussians, NO_CAMERAS)
     with record_run() as log:
         whole = add_views(blind)
     assert len(whole) == len(whole.names) >= 1
@@ -135,7 +135,7 @@ def test_unknown_cameras_are_placed(room: Scene) -> None:
 
 
 def test_placed_cameras_see_most_gaussians(room: Scene) -> None:
-    blind = add_views(Scene(room.gaussians, unaligned_scenes.NO_CAMERAS, None, None, ()))
+    blind = add_views(make_scene(room.gaussians, NO_CAMERAS))
     groups = Groups(np.zeros((len(blind), blind.cameras.height, blind.cameras.width), np.int32), (1,) * len(blind))
     owners = find_owners(blind, groups)
     assert (owners.values > 0).mean() > 0.8

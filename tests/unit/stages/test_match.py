@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -91,13 +92,8 @@ def test_a_crowd_of_the_own_view_hides_nobody(method: str) -> None:
     assert max(map(len, sets(features, match=method))) == (2 if method == "overlap" else 41)
 
 
-def test_match_none_leaves_every_feature_alone() -> None:
-    assert sets(make_features(np.zeros((4, 3))), match="none") == alone(4)
-
-
-@pytest.mark.parametrize("method", [*METHODS, "none"])
-@pytest.mark.parametrize("count", [0, 1])
-def test_no_feature_or_one_makes_no_pair(method: str, count: int) -> None:
+@pytest.mark.parametrize(("method", "count"), [*product((*METHODS, "none"), (0, 1)), ("none", 4)])
+def test_no_feature_or_one_or_match_none_makes_no_pair(method: str, count: int) -> None:
     assert sets(make_features(np.zeros((count, 3))), match=method) == alone(count)
 
 

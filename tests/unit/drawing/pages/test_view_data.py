@@ -83,7 +83,6 @@ def decoded(still: bytes | None) -> np.ndarray:
 
 def unpacked(packed: bytes | None) -> tuple[dict[str, Any], np.ndarray]:
     """Return the numbers of what the page holds: its head, and ``[n,columns]``."""
-    assert packed is not None
     assert packed[9:10] == UNIX
     line, _, rest = gzip.decompress(packed).partition(b"\n")
     head = json.loads(line)

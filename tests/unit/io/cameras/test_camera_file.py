@@ -24,7 +24,14 @@ from tiny_scene import (
 
 from gsmerge.errors import SceneError
 from gsmerge.io import read_cameras, to_cameras
-from gsmerge.io.cameras.camera_file import make_lens, select_views, undistort_photos
+from gsmerge.io.cameras.camera_file import (
+    W2C_OPENCV,
+    StoredView,
+    make_camera_file,
+    make_lens,
+    select_views,
+    undistort_photos,
+)
 from gsmerge.jobs.inspect import inspect
 from gsmerge.kernels import elementary
 from gsmerge.reading.read_scene import load_scene
@@ -62,8 +69,6 @@ def test_opengl_axes_become_those_of_opencv_as_by_hand(tmp_path: Path) -> None:
 
 
 SMOOTH = smooth_scene(60, 45)
-
-
 K = np.array([[180.0, 0, 96], [0, 170, 77], [0, 0, 1]])
 
 
@@ -194,3 +199,12 @@ def test_a_lens_among_pinholes_belongs_to_its_view_alone(tmp_path: Path, tiny: T
     with refuses(SceneError, "transforms.json: view images/a b/10.png", "OPENCV"):
         to_cameras(actual)
     assert to_cameras(select_views(actual, [0, 2])).width == 20
+
+
+@pytest.mark.parametrize(
+    ("K", "size"), [([[9.0, 0, 4], [0, 9, 4], [0, 0, 1]], (8, 8)), ([[50.0, 0, 0.5], [0, 50, 0.5], [0, 0, 1]], (0, 0))]
+)
+def test_small_intrinsics_in_pixels_are_not_scaled(K: list[list[float]], size: tuple[int, int]) -> None:
+    read = make_camera_file("x", "x", W2C_OPENCV, [StoredView("a", np.eye(4), np.array(K), size)])
+    assert np.array_equal(read.Ks[0], np.array(K))
+    assert (int(read.widths[0]), int(read.heights[0])) == size

@@ -279,7 +279,6 @@ def test_lenses_of_a_layout_are_read(
     tmp_path: Path, name: str, old: str, new: str, model: str, coefficients: tuple[float, ...]
 ) -> None:
     lens = read_cameras(FORMATS[name].write(tmp_path, old, new)).lenses[0]
-    assert lens is not None
     assert (lens.model, lens.coefficients) == (model, coefficients)
 
 

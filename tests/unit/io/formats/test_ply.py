@@ -7,13 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scenes
 from former_formats import compressed_bytes
 from messages import refuses
 
+from gsmerge import write_ply
 from gsmerge.errors import SceneError, list_doubts
 from gsmerge.io import read_gaussians, read_ply
 from gsmerge.io.formats import ply
-from gsmerge.io.formats.ply import header_counts, open_ply
+from gsmerge.io.formats.ply import COMMENT_BYTES, count_for_bytes, file_bytes, header_counts, open_ply
 from gsmerge.io.formats.read_gaussians import file_notes, read_parts
 from gsmerge.io.formats.rows import FileRows
 from gsmerge.io.formats.table import estimate_counts
@@ -156,3 +158,28 @@ def test_all_missing_columns_are_named(tmp_path: Path) -> None:
         read_ply(points)
     with refuses(SceneError, "a.html", ".compressed.ply, .ply, .spz", ".gsm", "meta.json"):
         read_gaussians(tmp_path / "a.html")
+
+
+@pytest.mark.parametrize("degree", [0, 1])
+@pytest.mark.parametrize("count", [1, 9, 10, 144])
+def test_file_bytes_are_the_size_of_the_written_file(count: int, tmp_path: Path, degree: int) -> None:
+    scene = scenes.make_scene(scenes.wall(), scenes.arc(1, 16, 9), degree=degree)
+    write_ply(tmp_path / f"{count}.ply", scene.gaussians[:count])
+    assert (tmp_path / f"{count}.ply").stat().st_size == file_bytes(count, degree)
+
+
+@pytest.mark.parametrize("degree", range(5))
+def test_count_for_bytes_is_the_most_that_fits(degree: int) -> None:
+    sizes = [file_bytes(1, degree), 10_000, 68_000, 68_001, 5_000_000]
+    sizes += [file_bytes(10**k, degree) - d for k in (1, 2, 5) for d in (0, 1, 2)]
+    for size in sizes:
+        if size >= file_bytes(1, degree):
+            count = count_for_bytes(size + COMMENT_BYTES, degree)
+            assert file_bytes(count, degree) <= size < file_bytes(count + 1, degree)
+
+
+def test_sizes_and_degrees_out_of_range_have_no_count() -> None:
+    with refuses(ValueError, "budget", 502 + COMMENT_BYTES, 100):
+        count_for_bytes(100, 0)
+    with refuses(ValueError, "sh_degree", "0 to 4", 5):
+        count_for_bytes(10**6, 5)

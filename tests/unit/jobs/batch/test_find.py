@@ -25,22 +25,28 @@ def find_paths(*given: str, out: Path = OUT) -> list[str]:
     return [scene.as_posix() for scene in find_scenes(given, out)]
 
 
-def test_scenes_are_found_in_a_folder_at_every_depth() -> None:
-    touch("all/b/scene.ply", "all/b/other.ply", "all/a/x.ply", "all/a/y.ply", "all/deep/er/gs_ply/0000.ply")
-    touch("all/inria/point_cloud/iteration_7000/point_cloud.ply", "all/inria/input.ply", "all/z.ply")
-    expected = ["all/z.ply", "all/a/x.ply", "all/a/y.ply", "all/b", "all/deep/er", "all/inria"]
-    assert find_paths("all") == expected
+FOLDERS: dict[str, tuple[list[str], list[str]]] = {  # files in a folder, and the scenes that are found in it
+    "scenes at every depth": (
+        ["b/scene.ply", "b/other.ply", "a/x.ply", "a/y.ply", "deep/er/gs_ply/0000.ply", "inria/input.ply", "z.ply",
+         "inria/point_cloud/iteration_7000/point_cloud.ply"],
+        ["all/z.ply", "all/a/x.ply", "all/a/y.ply", "all/b", "all/deep/er", "all/inria"],
+    ),
+    "results, hidden files and point clouds": (
+        ["a.ply", "a.compact.ply", "a.compact.level1.ply", ".a-00112233.ply", ".hidden/b.ply", "points3D.ply",
+         "c/scene.ply", "c/images/mask.ply", "input/d.ply"],
+        ["all/a.ply", "all/c", "all/input/d.ply"],
+    ),
+    "a folder of Gaussians inside a scene": (["scene.ply", "gs_ply/0000.ply", "more/scene.ply"], ["all", "all/more"]),
+    "a name that looks like a pattern": (["run[1]/scene.ply"], ["all/run[1]"]),
+}  # fmt: skip
 
 
-def test_results_hidden_files_and_point_clouds_are_passed_by() -> None:
-    touch("all/a.ply", "all/a.compact.ply", "all/a.compact.level1.ply", "all/.a-00112233.ply", "all/.hidden/b.ply")
-    touch("all/points3D.ply", "all/c/scene.ply", "all/c/images/mask.ply", "all/input/d.ply")
-    assert find_paths("all") == ["all/a.ply", "all/c", "all/input/d.ply"]
-
-
-def test_a_folder_of_gaussians_inside_a_scene_is_no_scene_of_its_own() -> None:
-    touch("all/scene.ply", "all/gs_ply/0000.ply", "all/more/scene.ply")
-    assert find_paths("all") == ["all", "all/more"]
+@pytest.mark.parametrize("case", FOLDERS)
+def test_scenes_alone_are_found_in_a_folder(case: str) -> None:
+    files, scenes = FOLDERS[case]
+    touch(*(f"all/{file}" for file in files))
+    assert find_paths("all") == scenes
+    assert find_paths(scenes[-1]) == scenes[-1:]
 
 
 def test_a_point_cloud_with_the_name_of_a_scene_is_a_scene_that_fails() -> None:
@@ -92,11 +98,6 @@ def test_patterns_and_lists_give_the_scenes_that_they_name() -> None:
     assert find_paths("s/**/scene.ply") == ["s/one/scene.ply", "s/two/scene.ply"]
     Path("s/list.txt").write_text("# mine\none\n\n  x.ply  \ngone.ply\n")
     assert find_paths("s/list.txt") == ["s/one", "s/x.ply", "s/gone.ply"]  # what is gone fails when its turn comes
-
-
-def test_a_folder_whose_name_looks_like_a_pattern_is_found_by_its_name() -> None:
-    touch("run[1]/scene.ply")
-    assert find_paths("run[1]") == ["run[1]"]
 
 
 def link(path: str, target: str) -> None:

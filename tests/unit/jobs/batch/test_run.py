@@ -1,8 +1,9 @@
-"""A scene of a batch is made, skipped or refused, and a kill at any moment leaves nothing half done."""
+"""Scenes of a batch are spread, made, skipped or refused, and a kill at any moment leaves nothing half done."""
 
 from __future__ import annotations
 
 import errno
+import math
 import os
 import re
 import shutil
@@ -24,17 +25,21 @@ from shared import write_scene
 
 from gsmerge.errors import SceneError
 from gsmerge.io import atomic
+from gsmerge.jobs.batch import BatchOptions, Job, run_batch
 from gsmerge.jobs.batch import jobs as calls
 from gsmerge.jobs.batch import run as runs
-from gsmerge.jobs.batch import run_batch
-from gsmerge.jobs.batch.jobs import find_jobs
+from gsmerge.jobs.batch.jobs import CompactCall, find_jobs
 from gsmerge.jobs.batch.records import DONE, FAILED, SKIPPED, prepare_folder
-from gsmerge.jobs.batch.run import Run, lock_result, pending_jobs, remove_unfinished, run_job
+from gsmerge.jobs.batch.run import Run, choose_concurrency, lock_result, pending_jobs, remove_unfinished, run_job
+from gsmerge.reading.exporters import NO_HINTS
+from gsmerge.runtime.memory import memory_bytes
+from gsmerge.runtime.processes import ProcessPool
+from gsmerge.runtime.work import Call
+from gsmerge.settings.compact import CompactOptions
 
 
 def test_a_lock_of_a_result_is_held_once_and_leaves_no_file(tmp_path: Path) -> None:
     with lock_result(tmp_path, "a.ply", wait=False) as begun:
-        assert begun is not None
         assert not begun.exists()
         with lock_result(tmp_path, "a.ply", wait=False) as second:
             assert second is None
@@ -220,7 +225,6 @@ def test_a_failure_says_that_the_earlier_result_stays(scene: Path, out: Path, mo
     job, started = one_job(scene, out)
     [(_, foreseen)] = pending_jobs([job], out, QUICK)
     ended = run_job(job, started, wait=False)
-    assert ended is not None
     assert foreseen == ended["error"]
     assert says(foreseen, "scene.ply", "Permission denied", "stays")
 
@@ -287,7 +291,6 @@ def test_cameras_that_no_batch_wrote_are_not_replaced(scene: Path, out: Path) ->
 def test_a_scene_that_another_run_works_on_is_left_to_that_run(scene: Path, out: Path) -> None:
     job, started = one_job(scene, out)
     with lock_result(out, "room.ply", wait=False) as begun:
-        assert begun is not None
         begun.touch()
         (out / left_by_a_dead_process()).touch()
         assert run_job(job, started, wait=False) is None
@@ -410,7 +413,6 @@ def left_by_a_dead_process() -> str:
 def leave_mark(out: Path) -> Path:
     """Leave the mark of a process that was killed while it worked on the scene."""
     with lock_result(out, "room.ply", wait=False) as begun:
-        assert begun is not None
         begun.touch()
     return begun
 
@@ -426,7 +428,6 @@ def test_a_run_that_is_given_up_leaves_only_its_record(scene: Path, out: Path) -
     leave_killed_run(out)
     (out / ".room-mine.ply").touch()
     actual = run_job(job, started, False, "killed")
-    assert actual is not None
     assert (actual["status"], actual["error"]) == (FAILED, "killed")
     assert records(out) == [actual]
     assert list(results(out)) == [".room-mine.ply"]
@@ -447,3 +448,87 @@ def test_a_run_stopped_before_its_record_leaves_the_mark_of_its_result(scene: Pa
     assert sorted(out.iterdir()) == sorted([mark, out / "room.ply"])
     assert run(scene, out)["status"] == DONE
     assert list(results(out)) == ["room.ply"]
+
+
+CALL = CompactCall(CompactOptions(), "auto", NO_HINTS)
+
+
+def make_jobs(*counts: int) -> list[Job]:
+    return [Job(f"{i}", (f"{i}.ply",), CALL, count) for i, count in enumerate(counts)]
+
+
+def set_machine(monkeypatch: pytest.MonkeyPatch, processors: int, memory: int | None) -> None:
+    monkeypatch.setattr(runs, "available_threads", lambda: processors)
+    monkeypatch.setattr(runs, "free_memory", lambda: memory)
+
+
+def test_processors_are_divided_among_scenes(monkeypatch: pytest.MonkeyPatch) -> None:
+    set_machine(monkeypatch, 8, 10**12)
+
+    def spread(count: int, **message: Any) -> tuple[int, int]:
+        settings = CompactOptions().with_settings({"threads": message.pop("threads", None)})
+        concurrency = choose_concurrency(make_jobs(*[1000] * count), BatchOptions(settings, **message))
+        return concurrency.jobs, concurrency.threads
+
+    assert spread(100) == (8, 1)
+    assert spread(3) == (3, 2)
+    assert spread(1) == (1, 8)
+    assert spread(0) == (1, 8)
+    assert spread(100, jobs=2) == (2, 4)
+    assert spread(100, jobs=20) == (20, 1)
+    assert spread(100, threads=4) == (2, 4)
+    assert spread(100, threads=4, jobs=3) == (3, 4)
+    assert spread(100, engine="ray") == (0, 1)
+    assert spread(100, engine="ray", jobs=5, threads=2) == (5, 2)
+
+
+def test_memory_limits_the_number_of_concurrent_scenes(monkeypatch: pytest.MonkeyPatch) -> None:
+    large, small = 10_000_000, 10_000
+    scenes, need = make_jobs(small, large, small, large, small), memory_bytes(large)
+
+    def count(share: float | None, **message: Any) -> int:
+        set_machine(monkeypatch, 4, None if share is None else int(share * need / runs.FREE_MEMORY_SHARE) + 1)
+        return choose_concurrency(scenes, BatchOptions(**message)).jobs
+
+    assert [count(3), count(1), count(None)] == [4, 4, 4]  # those that are larger than most wait for each other
+    assert count(1, jobs=3) == 3  # who asks for it gets it
+    scenes = make_jobs(small, large, large)
+    assert [count(4), count(2), count(1.9), count(0.5), count(None)] == [3, 2, 1, 1, 3]
+    assert choose_concurrency(scenes, BatchOptions(jobs=2)).memory == math.inf
+
+
+class Gauge(InlinePool):
+    """A pool of three calls at once, which end one after the other."""
+
+    capacity, most = 3, 0
+
+    def __init__(self, memory: float) -> None:
+        super().__init__()
+        self.memory, self.order, self.calls = memory, list[int](), dict[int, tuple[Call, None]]()
+
+    has_room = ProcessPool.has_room  # type: ignore[assignment]
+
+    def submit(self, _: Any, call: Call) -> None:
+        self.calls[call.key] = call, None
+        self.order.append(call.key)
+        self.most = max(self.most, sum(running.memory for running, _ in self.calls.values()))
+
+    def wait(self) -> list[tuple[Any, Any]]:
+        key = next(iter(self.calls))
+        return [(key, self.calls.pop(key)[0].memory)]
+
+
+@pytest.mark.parametrize(("memory", "most"), [(math.inf, 15), (12, 12), (10, 9), (8, 9), (0, 9)])
+def test_concurrent_calls_fit_into_the_memory_unless_one_is_alone(memory: float, most: int) -> None:
+    pool, sizes = Gauge(memory), [2, 3, 9, 2, 4, 1]
+    ended = dict(pool.run(int, (Call(key, (), size) for key, size in enumerate(sizes))))
+    assert ended == dict(enumerate(sizes))
+    assert pool.order == list(range(len(sizes)))
+    assert pool.most == most
+
+
+def test_a_scene_that_must_run_alone_comes_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    set_machine(monkeypatch, 4, 4 * memory_bytes(10))
+    monkeypatch.setattr(runs, "ProcessPool", InlinePool)
+    done = run_batch(make_jobs(10, 10**7, 10, 10), tmp_path, BatchOptions())
+    assert [line["scene"] for line in done] == ["0", "2", "3", "1"]

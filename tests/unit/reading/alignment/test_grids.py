@@ -14,10 +14,8 @@ from exports import smooth_scene
 from messages import noted
 from tiny_scene import Tiny, frames_of, write_npz
 
-from gsmerge.io.cameras.camera_file import W2C_OPENCV, StoredView, make_camera_file
 from gsmerge.io.photo_files import PhotoTransform, resize_and_crop, resize_to
 from gsmerge.reading.read_scene import load_scene
-from gsmerge.types import Cameras
 
 SMOOTH = smooth_scene(48, 36)
 
@@ -67,19 +65,6 @@ def test_cameras_of_uncropped_pictures_are_cropped_to_the_images(tmp_path: Path)
     assert loaded.notes == ("cameras of 96 x 54 are resized and centre-cropped to 48 x 36, the images' size",)
 
 
-@pytest.mark.parametrize("mapping", [resize_to((100, 60), (50, 24)), resize_and_crop((100, 60), (30, 30))])
-def test_photo_transforms_move_a_camera_as_they_move_its_photo(mapping: PhotoTransform) -> None:
-    photo = np.zeros((60, 100, 3), np.uint8)
-    photo[24:36, 64:72] = 255
-    (small,) = mapping.photos([photo])
-    assert small.shape == (mapping.height, mapping.width, 3)
-    y, x = (np.average(np.arange(n) + 0.5, weights=small[..., 0].sum(axis)) for n, axis in
-            ((mapping.height, 1), (mapping.width, 0)))  # fmt: skip
-    K = np.array([[[1.0, 0, 68], [0, 1, 30], [0, 0, 1]]], np.float64)
-    (moved,) = mapping.cameras(Cameras(np.eye(4)[None], K, 100, 60)).Ks
-    assert (x, y) == pytest.approx((float(moved[0, 2]), float(moved[1, 2])), abs=0.1)
-
-
 def test_intrinsics_stay_where_the_size_is_twice_the_principal_point(tmp_path: Path, tiny: Tiny) -> None:
     """They may be a pixel off; intrinsics stay those of the photos."""
     folder = tiny.save(tmp_path / "scene")
@@ -99,15 +84,6 @@ def test_intrinsics_divided_by_the_size_are_scaled_back(tmp_path: Path, tiny: Ti
     (folder / "camera_poses.txt").write_text("\n".join(" ".join(map(str, p.reshape(-1))) for p in tiny.c2w))
     (folder / "intrinsic.txt").write_text(f"{small[0, 0]} {small[1, 1]} {small[0, 2]} {small[1, 2]}")
     assert np.allclose(load_scene(folder).scene.cameras.Ks, tiny.K)
-
-
-@pytest.mark.parametrize(
-    ("K", "size"), [([[9.0, 0, 4], [0, 9, 4], [0, 0, 1]], (8, 8)), ([[50.0, 0, 0.5], [0, 50, 0.5], [0, 0, 1]], (0, 0))]
-)
-def test_small_intrinsics_in_pixels_are_not_scaled(K: list[list[float]], size: tuple[int, int]) -> None:
-    read = make_camera_file("x", "x", W2C_OPENCV, [StoredView("a", np.eye(4), np.array(K), size)])
-    assert np.array_equal(read.Ks[0], np.array(K))
-    assert (int(read.widths[0]), int(read.heights[0])) == size
 
 
 def test_rows_in_any_order_are_read_with_smaller_photos(tmp_path: Path) -> None:

@@ -109,13 +109,12 @@ def test_keypoints_moved_by_a_rounding_error_move_no_place(parts: list[Scene], m
     """Places are rounded, and what moves keypoints by a rounding error moves no place."""
     places = register(parts[:2]).similarities
     assert places[1].scale == round(places[1].scale, DIGITS)
-    find = keypoints._detect_keypoints
 
-    def shaken(picture: np.ndarray, stretch: float) -> tuple[np.ndarray, np.ndarray]:
-        pixels, descriptors = find(picture, stretch)
-        return pixels * (1 + 2e-16), descriptors
+    def shaken(scene: Scene) -> list[keypoints.PhotoKeypoints]:
+        found = keypoints.find_keypoints(scene)
+        return [replace(each, pixels=each.pixels * (1 + 2e-16), points=each.points * (1 + 2e-16)) for each in found]
 
-    monkeypatch.setattr(keypoints, "_detect_keypoints", shaken)
+    monkeypatch.setattr("gsmerge.reading.alignment.registration.register.find_keypoints", shaken)
     other = register(parts[:2]).similarities[1]
     for name in ("rotation", "scale", "shift"):
         assert np.array_equal(getattr(other, name), getattr(places[1], name))

@@ -97,11 +97,9 @@ def test_frames_of_a_film_that_show_the_views_are_found(views: np.ndarray, photo
 def test_parts_tell_a_neighbour_s_photo(views: np.ndarray, photos: list[np.ndarray]) -> None:
     shown = show(views, OFFSET_PIXELS)
     own = find_offsets(shown, 2, photos[2])
-    assert own is not None
     assert own.verdict is True
     beside = np.roll(photos[2], 8, 1)
     moved = find_offsets(shown, 2, beside)
-    assert moved is not None
     assert moved.verdict is False
     assert moved.num_moved_together > moved.num_in_place
     assert find_offsets(show(views, 32), 2, photos[2]) is None  # too small for parts

@@ -52,7 +52,6 @@ def test_a_part_that_fits_is_cut_out(tmp_path: Path, name: str) -> None:
     loaded = load_scene(tmp_path)
     images = loaded.scene.images
     assert noted(loaded.notes, *words)
-    assert images is not None
     assert np.abs(images * 255 - SMOOTH.images).mean() < 6
 
 
@@ -89,10 +88,8 @@ def test_masks_are_cut_as_the_larger_photos_are(tmp_path: Path) -> None:
     for name in SMOOTH.names:
         assert cv2.imwrite(str(tmp_path / "masks" / f"{name}.png"), mask)
     scene = load_scene(tmp_path).scene
-    assert scene.masks is not None
     assert scene.masks[:, :, 24:].all()
     assert not scene.masks[:, :, :24].any()
-    assert scene.large_photos is not None
     assert (scene.large_photos.width, scene.large_photos.height) == (96, 72)
 
 

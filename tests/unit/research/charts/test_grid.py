@@ -103,7 +103,6 @@ def test_without_targets_some_photos_judge_all_runs(made_scene: Path) -> None:
     """Of fewer than four photos none can be spared."""
     scene = gsmerge.read_scene(made_scene)
     rest, held_out = hold_out(scene)
-    assert held_out is not None
     assert (len(rest), held_out.names) == (4, (scene.names[1],))
     assert np.array_equal(held_out.images[0], scene.images[1])
     assert scene.names[1] not in rest.names

@@ -72,22 +72,13 @@ def test_confidence_interval_has_the_t_factors_of_the_tables(count: int, factor:
     assert half * math.sqrt(count) / np.std(values, ddof=1) == pytest.approx(factor, abs=5e-4)
 
 
-def test_confidence_interval_of_one_value_has_no_width() -> None:
+def test_intervals_of_one_value_have_no_width_and_of_none_are_refused() -> None:
     actual = mean_interval([21.5])
     assert (actual.mean, actual.low, actual.high, actual.count) == (21.5, 21.5, 21.5, 1)
-
-
-def test_confidence_interval_of_no_values_is_refused() -> None:
+    assert [(i.low, i.high) for i in paired_intervals(np.array([[1.0, 2.0]]))] == [(1, 1), (2, 2)]
+    assert paired_intervals(np.array([[1.0], [3.0]])) == [mean_interval([1.0, 3.0])]
     with refuses(ValueError, "", "value", "none"):
         mean_interval([])
-
-
-def test_paired_intervals_of_one_scene_have_no_width() -> None:
-    assert [(i.low, i.high) for i in paired_intervals(np.array([[1.0, 2.0]]))] == [(1, 1), (2, 2)]
-
-
-def test_paired_interval_of_one_line_is_its_confidence_interval() -> None:
-    assert paired_intervals(np.array([[1.0], [3.0]])) == [mean_interval([1.0, 3.0])]
 
 
 def test_paired_intervals_match_a_slow_twin() -> None:

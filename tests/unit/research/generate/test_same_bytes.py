@@ -7,8 +7,7 @@ import subprocess
 import sys
 
 import pytest
-
-from gsmerge.kernels.library import _runnable_targets
+from targets import runnable_targets
 
 SCENE = """
 import hashlib
@@ -28,7 +27,7 @@ OTHERS = {
 
 @pytest.mark.slow
 def test_scenes_do_not_depend_on_the_processor() -> None:
-    targets = [target.name for target in _runnable_targets()]
+    targets = runnable_targets()
     scenes = {
         subprocess.run([sys.executable, "-c", SCENE], env=env, capture_output=True, text=True, check=True).stdout
         for env in (

@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
-import scenes
 from messages import refuses
 
-from gsmerge import write_ply
-from gsmerge.io.formats.ply import COMMENT_BYTES, count_for_bytes, file_bytes
 from gsmerge.settings.budget import parse_budget, parse_bytes
 
 
@@ -63,28 +58,3 @@ def test_sizes_are_read_as_bytes(text: str | int, size: int) -> None:
 def test_impossible_sizes_are_refused(text: str) -> None:
     with refuses(ValueError, "budget", '"5MB"', f"'{text}'"):
         parse_bytes(text)
-
-
-@pytest.mark.parametrize("degree", [0, 1])
-@pytest.mark.parametrize("count", [1, 9, 10, 144])
-def test_file_bytes_are_the_size_of_the_written_file(count: int, tmp_path: Path, degree: int) -> None:
-    scene = scenes.make_scene(scenes.wall(), scenes.arc(1, 16, 9), degree=degree)
-    write_ply(tmp_path / f"{count}.ply", scene.gaussians[:count])
-    assert (tmp_path / f"{count}.ply").stat().st_size == file_bytes(count, degree)
-
-
-@pytest.mark.parametrize("degree", range(5))
-def test_count_for_bytes_is_the_most_that_fits(degree: int) -> None:
-    sizes = [file_bytes(1, degree), 10_000, 68_000, 68_001, 5_000_000]
-    sizes += [file_bytes(10**k, degree) - d for k in (1, 2, 5) for d in (0, 1, 2)]
-    for size in sizes:
-        if size >= file_bytes(1, degree):
-            count = count_for_bytes(size + COMMENT_BYTES, degree)
-            assert file_bytes(count, degree) <= size < file_bytes(count + 1, degree)
-
-
-def test_sizes_and_degrees_out_of_range_have_no_count() -> None:
-    with refuses(ValueError, "budget", 502 + COMMENT_BYTES, 100):
-        count_for_bytes(100, 0)
-    with refuses(ValueError, "sh_degree", "0 to 4", 5):
-        count_for_bytes(10**6, 5)

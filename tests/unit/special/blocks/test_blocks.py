@@ -192,7 +192,6 @@ def fit_every_second(scene: Scene, steps: int, faint: int) -> tuple[Gaussians, G
     photos = fit_photos(PicturedScene.with_pictures(canonical, scene.images, None), settings)
     start = replace(start, means=start.means.astype(np.float32), opacities=opacities)
     fitted, report = fit_gaussians(start, FitJob(photos, settings, len(start), fixed=fixed))
-    assert report is not None
     assert report.accepted
     assert settings.grows == (steps >= GROW_STEPS)
     return start, fitted, fixed
@@ -225,10 +224,8 @@ def test_views_of_blocks_are_joined_in_their_order(scene: Scene, monkeypatch: py
     for size in (1, 1 << 40):
         monkeypatch.setattr(memory, "MAPPED_BYTES", size)
         joined = join_views([(part, ids) for part, (ids, _) in zip(bare, chosen, strict=True)])
-        assert scene.images is not None
         assert np.array_equal(joined.images, scene.images[[6, 1, 3]])
         assert np.array_equal(joined.cameras.viewmats, scene.cameras.viewmats[[6, 1, 3]])
         assert joined.names == tuple(scene.names[view] for view in (6, 1, 3))
-        assert joined.masks is not None
         assert joined.masks[:2].all()
         assert np.array_equal(joined.masks[2], masks[3])

@@ -1,13 +1,22 @@
+"""Settings have names, types and ranges, and ask of a run one piece, all views, or a number of Gaussians."""
+
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import asdict, fields, is_dataclass, replace
+from pathlib import Path
+from typing import get_type_hints
 
 import pytest
 from messages import refuses
 
 from gsmerge import CompactOptions
+from gsmerge.settings.compact import ONE_PIECE, TRIAL
+from gsmerge.settings.extend import ExtendOptions
+from gsmerge.settings.keywords import BatchSettings, CompactSettings
 from gsmerge.settings.setting import flat_settings
 
 STAGES = [f.name for f in fields(CompactOptions) if is_dataclass(getattr(CompactOptions(), f.name))]
@@ -94,3 +103,59 @@ def test_settings_are_a_dictionary() -> None:
         CompactOptions().with_settings("4%")  # type: ignore[arg-type]
     with refuses(ValueError, "", "3", "k", "quality"):
         CompactOptions().with_settings({3: 4, "a": 5})  # type: ignore[dict-item]
+
+
+@pytest.mark.parametrize("values", [ONE_PIECE, TRIAL])
+def test_values_for_parts_of_a_scene_are_possible(values: dict[str, object]) -> None:
+    assert CompactOptions().with_settings(values).to_dict().items() >= values.items()
+
+
+def test_settings_that_need_the_scene_in_one_piece_are_named() -> None:
+    asked = {"method": "greedy", "budget": 100, "crop": "sphere:0,0,0,1", "drop": "floaters, unseen"}
+    named = CompactOptions().with_settings(asked).whole_only
+    assert set(named) == {"method greedy", "crop", "drop floaters", "drop unseen"}
+    levels = CompactOptions().with_settings({"levels": 2, "quality": "30dB"})
+    assert set(levels.whole_only) == {"levels", "quality 30dB"}
+    assert CompactOptions().whole_only == CompactOptions().uncut == []
+    uncut = CompactOptions().with_settings({"budget": "auto", "poses": "free", "exposure": "per-photo"})
+    assert set(uncut.uncut) == {"budget auto", "poses free", "exposure per-photo"}
+    assert uncut.whole_only == []
+
+
+def test_settings_tell_whether_the_scene_decides_the_count() -> None:
+    def decides(**settings: object) -> tuple[bool, bool, bool]:
+        options = CompactOptions().with_settings(settings)
+        return options.scene_decides, options.replaces_stages, options.changes_superpixels
+
+    assert decides() == decides(budget="auto") == decides(budget="mobile") == decides(checkpoint="none")
+    assert decides() == (True, False, False)
+    assert decides(budget=100) == decides(k=2) == decides(superpixels="2%") == decides(quality="30dB")
+    assert decides(budget=100) == (False, False, False)
+    assert decides(checkpoint="shipped") == (False, True, False)
+    assert decides(match="none") == decides(compactness=0.1) == decides(k_low=20.0) == (True, False, True)
+
+
+CALLS = """
+import gsmerge
+gsmerge.compact("room", budget="2%", k=2, fit="none")
+gsmerge.compact("room", budgte="2%")
+gsmerge.compact("room", fit="nothing")
+gsmerge.Compactor(max_views=3, effort="draft").compact(levels=2)
+gsmerge.Compactor(maxviews=3)
+"""
+
+
+def test_settings_have_the_types_of_their_fields() -> None:
+    declared = {name: setting.kind for name, setting in flat_settings(CompactOptions).items()}
+    assert get_type_hints(CompactSettings) == declared
+    added = {name: setting.kind for name, setting in flat_settings(ExtendOptions).items()}
+    assert get_type_hints(BatchSettings) == declared | added
+
+
+@pytest.mark.slow  # mypy reads the package, which takes half a minute
+def test_a_type_checker_refuses_settings_that_do_not_exist(tmp_path: Path) -> None:
+    (tmp_path / "calls.py").write_text(CALLS)
+    call = [sys.executable, "-m", "mypy", "--strict", "--no-error-summary", str(tmp_path / "calls.py")]
+    lines = subprocess.run(call, capture_output=True, text=True, check=False).stdout.splitlines()
+    wrong = {line.split(":")[1] for line in lines if line.startswith(str(tmp_path)) and ": error: " in line}
+    assert wrong == {"4", "5", "7"}

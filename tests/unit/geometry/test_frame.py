@@ -5,18 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scenes
-import unaligned_scenes
-from messages import noted, refuses
+from messages import refuses
 
-from gsmerge import Scene, render
-from gsmerge.fit import FitOptions, fit_photos
+from gsmerge import Scene
 from gsmerge.geometry.frame import canonicalise, scene_frame
 from gsmerge.geometry.transforms import project
-from gsmerge.prepare.prepare_scene import prepare
-from gsmerge.prepare.row_colors import PHOTOS, ROW_COLORS
-from gsmerge.raster.photos import MASKED_WEIGHT, scene_pictures
-from gsmerge.reading.photos.scene_photos import without_photo
-from gsmerge.runtime.record import record_part
 
 
 @pytest.fixture(scope="module")
@@ -94,34 +87,3 @@ def test_gaussians_in_the_cameras_plane_have_a_unit() -> None:
     flat = scenes.make_scene(scenes.wall(), scenes.arc(1, 8, 6))
     still = replace(flat, gaussians=replace(flat.gaussians, means=flat.cameras.centres.repeat(48, 0)))
     assert scene_frame(still).unit == 1.0
-
-
-def test_renders_stand_in_for_photos_only_where_no_pixels_are_known(scene: Scene) -> None:
-    """A fit to renders of one Gaussian per pixel would keep its errors: its pixels' own colours are taken."""
-    bare = replace(scene, images=None)
-    aligned, unaligned = prepare(bare), prepare(replace(bare, pixels=None))
-    np.testing.assert_allclose(aligned.scene.images, scene_pictures(bare), atol=1e-6)
-    assert aligned.input_scene.images is not None
-    assert aligned.reference.name == ROW_COLORS
-    assert unaligned.scene.images is not None
-    assert unaligned.input_scene.images is None
-    with record_part(silent=True) as record:
-        prepare(replace(bare, pixels=None))
-    assert noted(record.notes, "no photos", "the rows are not the pixels of the views", "--images")
-
-
-@pytest.mark.parametrize("own", [True, False], ids=["rows are pixels", "rows are no pixels"])
-def test_views_without_a_photo_take_part_in_a_fit(own: bool) -> None:
-    """Colours of the view's own Gaussians count as a photo, and drawings as what masks leave out."""
-    room = scenes.make_scene(scenes.room(), scenes.arc(3, 32, 24))
-    prepared = prepare(without_photo(room if own else unaligned_scenes.without_order(room), [1]))
-    reference, scene = prepared.reference, prepared.scene
-    assert (reference.name, reference.score_views) == (PHOTOS, (0, 2))
-    weights = fit_photos(scene, FitOptions())[0].weights
-    if own:
-        assert scene.masks is None
-        assert weights is None
-    else:
-        np.testing.assert_array_equal(scene.masks.all((1, 2)), [True, False, True])
-        np.testing.assert_array_equal(weights[:, 0, 0], [1, MASKED_WEIGHT, 1])
-        np.testing.assert_array_equal(scene.images[1], render(scene.gaussians, scene.cameras[[1]]).images[0].clip(0, 1))

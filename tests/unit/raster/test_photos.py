@@ -1,4 +1,4 @@
-"""Scenes are judged by a sample of the input views."""
+"""Samples of a photo's pixels are drawn as among the others, and scores of some tiles are those of all."""
 
 from __future__ import annotations
 
@@ -7,12 +7,29 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scenes
+from made_gaussians import random_gaussians
 
 from gsmerge import Scene
 from gsmerge.raster.composite import composite
 from gsmerge.raster.metrics import MAX_PSNR, psnr_words
-from gsmerge.raster.photos import NEAR_PLANE, render_photos, scene_photos, score_photos, scored_tiles
+from gsmerge.raster.photos import NEAR_PLANE, Photos, Sample, render_photos, scene_photos, score_photos, scored_tiles
 from gsmerge.raster.tiled_view import make_splats, tile_view
+
+WIDTH, HEIGHT = 45, 31
+K = np.array([[40.0, 0, 21.3], [0, 38.0, 14.9], [0, 0, 1]])
+
+
+@pytest.mark.parametrize("sample", [Sample(), Sample(2), Sample(2, 1, 0), Sample(2, 1, 1), Sample(3, 2, 1)])
+def test_a_sample_shows_what_its_pixels_show(sample: Sample) -> None:
+    rng = np.random.default_rng(0)
+    images = rng.random((1, HEIGHT, WIDTH, 3), np.float32)
+    photos = Photos(images, np.eye(4)[None], K[None], 0.3)
+    splats = make_splats(random_gaussians(80, 0))
+    whole, _ = composite(tile_view(splats, **photos.camera(0)))
+    some, _ = composite(tile_view(splats, **photos.camera(0, sample)))
+    assert (whole > 0.05).mean() > 0.2
+    np.testing.assert_allclose(some, whole[sample.pixels], atol=2e-5)
+    assert np.array_equal(photos.image(0, sample=sample), images[0][sample.pixels])
 
 
 @pytest.fixture(scope="module")

@@ -22,7 +22,7 @@ def scene() -> Scene:
     return scenes.make_scene(scenes.room(), scenes.arc(3, 32, 24))
 
 
-def test_bytes_are_scaled(scene: Scene) -> None:
+def test_pictures_of_bytes_are_scaled(scene: Scene) -> None:
     levels = np.round(scene.images * 255)
     assert as_pictures(levels.astype(np.uint8)).dtype == np.float32
     rounded, of_bytes = (
@@ -37,7 +37,7 @@ def test_bytes_are_scaled(scene: Scene) -> None:
     (lambda images: images * 255, "divide them by 255"), (lambda images: images - 0.5, "clip them"),
     (lambda images: images * 3, "divide|clip"), (lambda images: images * np.float32(np.nan), "clip them"),
 ])  # fmt: skip
-def test_others_are_refused(scene: Scene, change: Any, remedy: str) -> None:
+def test_pictures_beyond_their_range_are_refused_with_a_remedy(scene: Scene, change: Any, remedy: str) -> None:
     images = change(scene.images)
     with pytest.raises(ValueError, match=remedy):
         gsmerge.compact(replace(scene, images=images), **QUICK)
@@ -48,6 +48,6 @@ def test_others_are_refused(scene: Scene, change: Any, remedy: str) -> None:
         gsmerge.evaluate(replace(scene, images=images), {"a": scene.gaussians})
 
 
-def test_what_rounding_leaves_is_taken(scene: Scene) -> None:
+def test_pictures_that_rounding_left_above_1_are_taken(scene: Scene) -> None:
     images = scene.images * np.float32(1.001)
     assert as_pictures(images) is images

@@ -1,4 +1,4 @@
-"""Placed views judge the results of a scene of which no view is known."""
+"""Scenes are prepared with photos, colours of rows or renders; placed views judge those of which no view is known."""
 
 from __future__ import annotations
 
@@ -10,19 +10,53 @@ import scenes
 import unaligned_scenes
 from messages import noted
 
-from gsmerge import CompactOptions, Gaussians, Scene, compact, render
-from gsmerge.fit import FitOptions, fit_scene
+from gsmerge import Gaussians, Scene, compact, render
+from gsmerge.fit import FitOptions, fit_photos, fit_scene
 from gsmerge.geometry.transforms import project
-from gsmerge.plan import is_without_views
-from gsmerge.prepare.place_cameras import HELD_OUT, place_viewpoints
+from gsmerge.prepare.place_cameras import HELD_OUT
 from gsmerge.prepare.prepare_scene import Prepared, prepare
-from gsmerge.runtime.record import record_run
+from gsmerge.prepare.row_colors import PHOTOS, ROW_COLORS
+from gsmerge.raster.photos import MASKED_WEIGHT, scene_pictures
+from gsmerge.reading.photos.scene_photos import without_photo
+from gsmerge.runtime.record import record_part, record_run
 from gsmerge.stages.fit_pairs import merge_scene
+from gsmerge.types import NO_CAMERAS, make_scene
+
+
+def test_renders_stand_in_for_photos_only_where_no_pixels_are_known() -> None:
+    """A fit to renders of one Gaussian per pixel would keep its errors: its pixels' own colours are taken."""
+    bare = replace(scenes.make_scene(scenes.room(), scenes.arc(2, 32, 24)), images=None)
+    aligned, unaligned = prepare(bare), prepare(replace(bare, pixels=None))
+    np.testing.assert_allclose(aligned.scene.images, scene_pictures(bare), atol=1e-6)
+    assert aligned.input_scene.images is not None
+    assert aligned.reference.name == ROW_COLORS
+    assert unaligned.scene.images is not None
+    assert unaligned.input_scene.images is None
+    with record_part(silent=True) as record:
+        prepare(replace(bare, pixels=None))
+    assert noted(record.notes, "no photos", "the rows are not the pixels of the views", "--images")
+
+
+@pytest.mark.parametrize("own", [True, False], ids=["rows are pixels", "rows are no pixels"])
+def test_views_without_a_photo_take_part_in_a_fit(own: bool) -> None:
+    """Colours of the view's own Gaussians count as a photo, and drawings as what masks leave out."""
+    room = scenes.make_scene(scenes.room(), scenes.arc(3, 32, 24))
+    prepared = prepare(without_photo(room if own else unaligned_scenes.without_order(room), [1]))
+    reference, scene = prepared.reference, prepared.scene
+    assert (reference.name, reference.score_views) == (PHOTOS, (0, 2))
+    weights = fit_photos(scene, FitOptions())[0].weights
+    if own:
+        assert scene.masks is None
+        assert weights is None
+    else:
+        np.testing.assert_array_equal(scene.masks.all((1, 2)), [True, False, True])
+        np.testing.assert_array_equal(weights[:, 0, 0], [1, MASKED_WEIGHT, 1])
+        np.testing.assert_array_equal(scene.images[1], render(scene.gaussians, scene.cameras[[1]]).images[0].clip(0, 1))
 
 
 def make_bare() -> Scene:
     room = scenes.make_scene(scenes.room(), scenes.arc(3), noise=0.01)
-    return Scene(room.gaussians, unaligned_scenes.NO_CAMERAS, None, None, ())
+    return make_scene(room.gaussians, NO_CAMERAS)
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +95,6 @@ def fit_scene_alone(prepared: Prepared, options: FitOptions) -> Gaussians:
     start = merge_scene(300, 1.0, prepared)
     views = [view for view in range(len(prepared.scene)) if view not in held_out]
     fitted = fit_scene(start, prepared.scene, options, 0, views=views, num_scored=len(views))
-    assert fitted.report is not None
     assert fitted.report.steps == 20
     return fitted.gaussians
 
@@ -81,7 +114,7 @@ def test_placed_views_judge_fog_or_holes_as_worse(bare: Scene) -> None:
     result = compact(bare, budget="30%", fit="none")
     judged = result.report.choices["fidelity"]["psnr"]
     g = bare.gaussians
-    half = Scene(g[g.means[:, 0] < np.median(g.means[:, 0])], unaligned_scenes.NO_CAMERAS, None, None, ())
+    half = make_scene(g[g.means[:, 0] < np.median(g.means[:, 0])], NO_CAMERAS)
     for spoilt in (_with_fog(result.gaussians), compact(half, budget="30%", fit="none").gaussians):
         prepared = prepare(bare)
         shown = render(prepared.frame.enter(spoilt), prepared.scene.cameras).images.clip(0, 1)
@@ -109,34 +142,9 @@ def test_a_scene_without_cameras_gets_one_note(bare: Scene) -> None:
     assert noted(record.notes, "no cameras", "--cameras", "--images")
 
 
-def test_a_run_without_views_is_one_without_networks_or_other_methods(bare: Scene) -> None:
-    options = CompactOptions()
-    assert is_without_views(bare, options)
-    assert not is_without_views(bare, options.with_settings({"checkpoint": "shipped"}))
-    assert not is_without_views(bare, options.with_settings({"method": "random"}))
-    assert not is_without_views(
-        unaligned_scenes.without_order(scenes.make_scene(scenes.room(), scenes.arc(2))), options
-    )
-
-
 def test_gaussians_far_behind_all_placed_views_take_part(bare: Scene) -> None:
     """Also what lies behind all views takes part."""
     far = unaligned_scenes.far_behind(bare.gaussians, 40)
     result = compact(replace(bare, gaussians=Gaussians.concat([bare.gaussians, far])), budget="20%")
     middle = far.means.mean(0)
     assert (np.abs(result.gaussians.means - middle) < np.ptp(far.means, 0) + 1).all(1).any()
-
-
-def test_half_of_the_viewpoints_stand_around_the_scene() -> None:
-    """So that an object is seen whole: a ball, whose inside shows as much of it."""
-    rng, count = np.random.default_rng(0), 3000
-    means = rng.normal(size=(count, 3))
-    means /= np.linalg.norm(means, axis=1, keepdims=True)
-    quats, sh0 = np.tile([1.0, 0, 0, 0], (count, 1)), rng.normal(0, 0.5, (count, 1, 3))
-    scales, opacities = np.full((count, 3), 0.03), np.full(count, 0.9)
-    arrays = [array.astype(np.float32) for array in (means, quats, scales, opacities, sh0, np.zeros((count, 0, 3)))]
-    ball = Gaussians(*arrays)
-    cameras = place_viewpoints(ball)
-    alphas = render(ball, cameras[: len(cameras) // 2]).alphas[..., 0]
-    assert max(alphas[:, [0, -1]].max(), alphas[:, :, [0, -1]].max()) < 0.1
-    assert (alphas.mean((1, 2)) > 0.2).all()

@@ -42,16 +42,17 @@ NAMINGS: list[Callable[[str], str]] = [
 
 
 @pytest.mark.parametrize("naming", NAMINGS)
-def test_masks_beside_the_photos_by_their_names(tiny_folder: Path, tiny: Tiny, naming: Callable[[str], str]) -> None:
+def test_masks_beside_the_photos_are_found_by_their_names(
+    tiny_folder: Path, tiny: Tiny, naming: Callable[[str], str]
+) -> None:
     write(tiny_folder / "masks" / naming(tiny.names[1]), half(tiny).astype(np.uint8) * 255)
     load = load_scene(tiny_folder)
-    assert load.scene.masks is not None
     assert np.array_equal(load.scene.masks[1], half(tiny))
     assert load.scene.masks[[0, 2]].all()  # they have none
     assert "masks leave out 17 % of the photos' pixels; 1 of 3 photos have a mask" in load.notes
 
 
-def test_masks_in_a_folder_are_of_the_photos_in_the_folder_of_its_name(tmp_path: Path) -> None:
+def test_masks_in_a_folder_belong_to_the_photos_in_the_folder_of_its_name(tmp_path: Path) -> None:
     """Unless no photo is in one."""
     for name in ("images/a/1.png", "images/b/1.png", "masks/a/1.png", "cut/c/1.png"):
         write(tmp_path / name, np.zeros((2, 2), np.uint8))
@@ -63,7 +64,7 @@ def test_masks_in_a_folder_are_of_the_photos_in_the_folder_of_its_name(tmp_path:
     assert noted(notes, "masks are not used", tmp_path / "masks", "1.png")
 
 
-def test_a_folder_of_masks_that_is_named(tiny_folder: Path, tiny: Tiny, tmp_path: Path) -> None:
+def test_a_folder_of_masks_that_is_named_is_used_or_refused(tiny_folder: Path, tiny: Tiny, tmp_path: Path) -> None:
     """Of twice the size, in another format, of 0 and 1."""
     large = half(tiny).repeat(2, 0).repeat(2, 1).astype(np.uint8)
     for name in tiny.names:
@@ -111,13 +112,13 @@ def test_bars_around_photos_are_cut_off(tiny_folder: Path, tiny: Tiny) -> None:
     assert "bars around the photos are cut off: 20 x 21 pixels become 20 x 14" in load.notes
 
 
-def test_a_folder_of_masks_in_a_format_that_is_not_read(tmp_path: Path) -> None:
+def test_a_folder_of_masks_in_a_format_that_is_not_read_is_a_doubt(tmp_path: Path) -> None:
     (tmp_path / "0.tga").write_bytes(b"")
     with refuses(SceneError, tmp_path, "0.png", "1 .tga", "convert"):
         match_masks(tmp_path, ["0.jpg"])
 
 
-def test_masks_of_many_bits_and_of_transparency(tmp_path: Path) -> None:
+def test_masks_of_many_bits_and_of_transparency_are_read(tmp_path: Path) -> None:
     levels = np.array([[0, 256, 65535, 40000]], np.uint16)
     write(tmp_path / "deep.png", levels)
     assert decode_levels(tmp_path / "deep.png").tolist() == [[0, 1, 255, 156]]
@@ -279,7 +280,6 @@ def test_grey_edges_of_a_mask_change_no_dark_pixel(tiny_folder: Path, tiny: Tiny
     soft[:, tiny.width // 2 - 1] = 200
     write(tiny_folder / "masks" / tiny.names[0], soft)
     importance = load_scene(tiny_folder).scene.importance
-    assert importance is not None
     assert (importance[0, :, : tiny.width // 2 - 1] == 1).all()
     assert (importance[0, :, tiny.width // 2 :] == 1).all()  # where the mask is dark; there photos do not count anyway
     assert (importance[0, :, tiny.width // 2 - 1] < 1).all()

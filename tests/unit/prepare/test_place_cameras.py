@@ -39,7 +39,6 @@ def scene_around(share: float = 1.0, power: float = 1.0, count: int = 6000) -> G
 
 def test_cameras_look_to_all_sides_from_near_the_place_of_the_viewer() -> None:
     cameras = place_inside(scene_around())
-    assert cameras is not None
     assert np.linalg.norm(cameras.centres - PLACE, axis=1).max() < 0.5  # what is nearest is 1.6 away
     forward = cameras.viewmats[:, 2, :3]
     assert np.linalg.norm(forward.mean(0)) < 0.1
@@ -58,7 +57,6 @@ def test_outliers_do_not_move_the_place() -> None:
     means = gaussians.means.copy()
     means[::20] += np.random.default_rng(2).normal(0, 500, (len(means[::20]), 3)).astype(np.float32)
     cameras = place_inside(Gaussians(**{**vars(gaussians), "means": means}))
-    assert cameras is not None
     assert np.linalg.norm(cameras.centres - PLACE, axis=1).max() < 0.6
 
 
@@ -81,3 +79,18 @@ def test_a_result_looks_from_the_inside_of_a_world_as_the_world_does() -> None:
     cameras = Cameras(viewmats, scenes.intrinsics(6, 64, 64), 64, 64)
     psnrs = [psnr(*pair) for pair in zip(*(render(each, cameras).images for each in (world, result)), strict=True)]
     assert min(psnrs) > 46
+
+
+def test_half_of_the_viewpoints_stand_around_the_scene() -> None:
+    """So that an object is seen whole: a ball, whose inside shows as much of it."""
+    rng, count = np.random.default_rng(0), 3000
+    means = rng.normal(size=(count, 3))
+    means /= np.linalg.norm(means, axis=1, keepdims=True)
+    quats, sh0 = np.tile([1.0, 0, 0, 0], (count, 1)), rng.normal(0, 0.5, (count, 1, 3))
+    scales, opacities = np.full((count, 3), 0.03), np.full(count, 0.9)
+    arrays = [array.astype(np.float32) for array in (means, quats, scales, opacities, sh0, np.zeros((count, 0, 3)))]
+    ball = Gaussians(*arrays)
+    cameras = place_viewpoints(ball)
+    alphas = render(ball, cameras[: len(cameras) // 2]).alphas[..., 0]
+    assert max(alphas[:, [0, -1]].max(), alphas[:, :, [0, -1]].max()) < 0.1
+    assert (alphas.mean((1, 2)) > 0.2).all()
