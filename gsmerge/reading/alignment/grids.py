@@ -101,7 +101,7 @@ def list_grids(camera_file: CameraFile, size: Size | None, num_rows: int) -> lis
     2. the photos, with cameras at their size, or without photos the cameras at their own size;
     3. the cameras at their own size, with photos resized to it;
     4. the photos, with cameras cropped to their shape, if photos and cameras differ in shape;
-    5. a multiple of the photos' size that has as many pixels as there are rows.
+    5. a grid in the photos' shape that has as many pixels as there are rows.
 
     Photos that would be enlarged too much are previews, which are not used, as a fit to them would blur the Gaussians.
 
@@ -112,6 +112,7 @@ def list_grids(camera_file: CameraFile, size: Size | None, num_rows: int) -> lis
     if camera_file.photo_map is not None:  # the size of photos, and how they are resized and cropped to the grid
         return [_mapped_grid(camera_file, size, *camera_file.photo_map)]
     stored, (width, height), grids = sizes_of(camera_file), size, list[Grid]()
+    max_enlarged = 1.5  # largest factor by which photos are enlarged; some networks enlarge small photos
     mismatch = next((camera_size for camera_size in stored if not same_shape(camera_size, size)), None)
     if mismatch is None:
         scaled = [camera_size for camera_size in stored if camera_size != size]
@@ -122,7 +123,6 @@ def list_grids(camera_file: CameraFile, size: Size | None, num_rows: int) -> lis
     if len(stored) == 1 and stored[0] != size:
         (camera_size,) = stored
         cameras, transform = to_cameras(camera_file, camera_size), resize_to(size, camera_size)
-        max_enlarged = 1.5  # largest factor by which photos are enlarged; some networks enlarge small photos
         if mismatch is not None:
             crop = resize_and_crop(camera_size, size)
             remark = f"cameras of {camera_size[0]} x {camera_size[1]} are {crop.description}, the images' size"
@@ -133,10 +133,15 @@ def list_grids(camera_file: CameraFile, size: Size | None, num_rows: int) -> lis
             remark = f"photos of {width} x {height} are {transform.description}"
             remark += ", the cameras' and the Gaussian grid's size"
             grids.append(Grid(camera_file, cameras, transform, (remark,)))
-    elif stored == [size]:
-        times = math.isqrt(num_rows // (len(camera_file) * width * height))
-        if times > 1:
-            grids.append(_preview_grid(camera_file, size, (times * width, times * height)))
+    rows_size = _size_of_rows(size, num_rows, len(camera_file))
+    if mismatch is None and rows_size is not None and rows_size not in (size, *stored):
+        transform = resize_to(size, rows_size)
+        if transform.scale_x > max_enlarged:
+            grids.append(_preview_grid(camera_file, size, rows_size))
+        elif transform.scale_x < 1 / max_enlarged:  # rows of a little smaller grid are those of pixels without borders
+            remark = f"photos of {width} x {height} are {transform.description}, the Gaussian grid's size"
+            # before the photos' own size, because rows may hit centres of its pixels, too
+            grids.insert(0, Grid(camera_file, to_cameras(camera_file, rows_size), transform, (remark,)))
     if mismatch is not None:
         found = "{} x {}".format(*mismatch)
         problem = f"expected cameras of the images' size {width} x {height} or a multiple of it, found {found}"
@@ -147,6 +152,14 @@ def list_grids(camera_file: CameraFile, size: Size | None, num_rows: int) -> lis
             raise error
         grids = [replace(grid, mismatch=error) for grid in grids]
     return grids
+
+
+def _size_of_rows(size: Size, num_rows: int, num_views: int) -> Size | None:
+    """Return the size of a grid in the shape of photos of ``size``, of which each row is a pixel; None if none is."""
+    width = round(math.sqrt(num_rows / num_views * size[0] / size[1]))
+    height = num_rows // max(1, num_views * width)
+    is_grid = num_views * width * height == num_rows and same_shape((width, height), size)
+    return (width, height) if is_grid else None
 
 
 def _preview_grid(camera_file: CameraFile, size: Size, grid_size: Size) -> Grid:

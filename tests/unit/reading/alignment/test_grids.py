@@ -94,3 +94,20 @@ def test_rows_in_any_order_are_read_with_smaller_photos(tmp_path: Path) -> None:
     scene = load_scene(tmp_path).scene
     assert (scene.cameras.width, scene.cameras.height, len(scene.images)) == (24, 18, 3)
     assert scene.num_gaussians == len(SMOOTH.gaussians)
+
+
+@pytest.mark.parametrize(
+    "size", [(144, 108), (192, 144), (120, 90)], ids=["odd multiple", "even multiple", "2.5 times"]
+)
+def test_rows_are_the_pixels_of_a_smaller_grid_beside_cameras_and_photos_as_they_were_taken(
+    size: tuple[int, int], tmp_path: Path
+) -> None:
+    K, photos = before_mapping(SMOOTH, resize_to(size, (48, 36)), size)
+    SMOOTH.save(tmp_path, cameras=False, images=False)
+    write_photos(tmp_path, SMOOTH, photos)
+    write_cameras(tmp_path, SMOOTH, K, size)
+    loaded = load_scene(tmp_path)
+    assert loaded.scene.has_own_pixels
+    assert (loaded.scene.cameras.width, loaded.scene.cameras.height) == (48, 36)
+    assert np.abs(loaded.scene.images * 255 - SMOOTH.images).mean() < 4  # of 255
+    assert noted(loaded.notes, "{} x {}".format(*size), "48 x 36")
