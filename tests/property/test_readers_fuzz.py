@@ -30,6 +30,7 @@ def test_changed_files_are_read_or_refused(kind: str, tmp_path: Path) -> None:
         attempt(kind, mutate(content, random), tmp_path / str(i))
 
 
-@pytest.mark.parametrize("path", sorted(FINDINGS.glob("*")), ids=lambda path: path.name)
-def test_files_that_once_failed_are_read_or_refused(path: Path, tmp_path: Path) -> None:
-    attempt(path.name.rpartition(".")[0], path.read_bytes(), tmp_path / "read")
+def test_files_that_once_failed_are_read_or_refused(tmp_path: Path) -> None:
+    """Files that the fuzzer has kept; there may be none."""
+    for path in sorted(FINDINGS.glob("*")):
+        attempt(path.name.rpartition(".")[0], path.read_bytes(), tmp_path / path.name)
