@@ -15,7 +15,9 @@ from pathlib import Path
 ROOT, TOOLS = Path(__file__).resolve().parent, Path(sys.executable).parent
 INSTALLED = ROOT / ".venv" / ("Scripts" if os.name == "nt" else "bin")  # tools that ``demo`` and ``setup`` install
 MAKE_VENV = ("python", "-m", "venv", ".venv")
-INSTALL = ("pip", "install", "-q", "-c", "constraints.txt", "-e")
+# constraints.txt pins versions for Python 3.11, of which some are not there for others
+PINS = ("-c", "constraints.txt") if sys.version_info[:2] == (3, 11) else ()
+INSTALL = ("pip", "install", "-q", *PINS, "-e")
 ROOM = ("demo", "--width", "480", "--height", "320", "--seed", "20")  # folder and options of the demo's scene
 MAIN_JOB = (
     ("python", "examples/01_make_scene.py", *ROOM),

@@ -49,7 +49,7 @@ def render(
         "folder.")],
     *,
     cameras: opt.Cameras = None, images: opt.Images = None, hint: opt.Hint = None,
-    output: Annotated[Path, opt.output("A picture, .png or .jpg: a panel of photos and scenes, or with --views "
+    output: Annotated[Path, opt.output("A picture, .png, .jpg or .webp: a panel of photos and scenes, or with --views "
         "NAME one view of one scene. A clip, .mp4, .webm or .gif; a moving line separates two scenes. A folder gets a "
         "picture of each camera.")],
     path: Annotated[str | None, opt.option(opt.OUTPUT, "orbit|spline|FILE", "Path of the camera. orbit: about the "
