@@ -15,9 +15,8 @@ import subprocess
 import sys
 import sysconfig
 import tempfile
+from dataclasses import dataclass  # setup.py runs this file without the package
 from pathlib import Path
-
-from gsmerge.frozen import dataclass
 
 FOLDER = Path(__file__).parent
 FLAGS = (
