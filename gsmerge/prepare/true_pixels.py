@@ -56,14 +56,14 @@ def raise_sizes(scene: SceneT, *, placed: bool = False) -> SceneT:
     that is drawn antialiased, because there the low-pass makes small Gaussians fainter instead of hiding their size.
     """
     g, cameras, by_distance = scene.gaussians, scene.cameras, placed and len(scene.gaussians) > 1
+    if cameras.antialiased and scene.images is None:
+        return scene
     homes = np.full(len(g), -1) if scene.pixels is None else scene.pixels.homes
     step = max(1, len(g) // ESTIMATE_GAUSSIANS)
     units = measure_pixel_sizes(g.means[::step], homes[::step], cameras)
     if by_distance:  # the Gaussians of a sample are farther apart than all Gaussians
         units = np.minimum(units, find_nearest(g.means[::step], 1)[1][:, 0] / math.sqrt(step))
-    if (cameras.antialiased and scene.images is None) or (
-        g.scales[::step].max(1) < HIDDEN_SIZE * LOW_PASS * units
-    ).mean() < FEWEST_HIDDEN:
+    if (g.scales[::step].max(1) < HIDDEN_SIZE * LOW_PASS * units).mean() < FEWEST_HIDDEN:
         return scene
     units = find_nearest(g.means, 1)[1][:, 0] if by_distance else measure_pixel_sizes(g.means, homes, cameras)
     sizes, seen = g.scales.max(1), (homes >= 0) | by_distance

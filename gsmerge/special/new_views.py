@@ -82,8 +82,7 @@ def expect_new_views(report: CompactReport, prepared: Prepared, plan: Plan) -> C
     result is worse.
     """
     start = perf_counter()
-    with record_part(silent=True):
-        trial = try_new_views(prepared, plan, report.num_output)
+    trial = try_new_views(prepared, plan, report.num_output)
     report = replace(report, seconds=report.seconds | {"new views": perf_counter() - start})
     before, after = compared_psnr(report.covered, report.psnr_before, report.psnr_after)
     if trial is None or prepared.agreement is None or before is None or after is None:
@@ -102,7 +101,7 @@ def expect_new_views(report: CompactReport, prepared: Prepared, plan: Plan) -> C
 def try_new_views(prepared: Prepared, plan: Plan, count: int) -> Trial | None:
     """Run the trial for a result of ``count`` Gaussians, in two rounds at once, and return what it measured.
 
-    Most of the steps on small pictures is Python, which one processor alone does, so each round has a thread.
+    Steps on small pictures spend most of their time in Python, on one processor, so each round has a thread.
     None if a trial could not predict a result of so many Gaussians, or if no view sees what left-out photos show.
     """
     pixels = prepared.scene.pixels_per_view * len(prepared.scene)
@@ -120,6 +119,7 @@ def try_new_views(prepared: Prepared, plan: Plan, count: int) -> Trial | None:
     return Trial(own, before, after, int((shares > LEAST_SEEN).sum()))
 
 
+@record_part(silent=True)
 def _score_round(prepared: Prepared, views: Sequence[int], plan: Plan, share: float) -> np.ndarray | None:
     """Leave out ``views``, compact other views near them at a small size, and score the result on the left-out photos.
 

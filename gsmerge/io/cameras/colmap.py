@@ -106,10 +106,9 @@ def _make_view(path: Path, camera_id: int, model: str, size: tuple[int, int], pa
     """Make a view of a camera, without a name and a pose; raise SceneError if the camera model is not supported."""
     if model not in _PERSPECTIVE_MODELS | _FISHEYE_MODELS:
         problem = f"camera {camera_id}: expected a pinhole, a perspective or a fisheye camera, found {model}"
-        is_panorama = model == "EQUIRECTANGULAR"
-        remedy = (
-            "cut cube faces from the panoramas, and give each a camera" if is_panorama else "undistort the images first"
-        )
+        remedy = "undistort the images first"
+        if model == "EQUIRECTANGULAR":
+            remedy = "cut cube faces from the panoramas, and give each a camera"
         raise SceneError(path, problem, remedy)
     num_intrinsics = 3 if model in _ONE_FOCAL else 4  # the rest are coefficients of the lens
     K = make_pinhole(params[0], *params[:3]) if model in _ONE_FOCAL else make_pinhole(*params[:4])

@@ -19,6 +19,7 @@ from gsmerge.reading.alignment.layouts import ESTIMATED
 from gsmerge.types import Cameras
 
 _PATCH = 14  # pixels; sides of vision transformers' inputs are multiples of this
+MAX_ENLARGED = 1.5  # largest factor by which photos are enlarged; some networks enlarge small photos
 _WHOLE_PX = 1e-3  # a side counts as whole if it differs from a whole number by less than these pixels
 
 
@@ -112,7 +113,6 @@ def list_grids(camera_file: CameraFile, size: Size | None, num_rows: int) -> lis
     if camera_file.photo_map is not None:  # the size of photos, and how they are resized and cropped to the grid
         return [_mapped_grid(camera_file, size, *camera_file.photo_map)]
     stored, (width, height), grids = sizes_of(camera_file), size, list[Grid]()
-    max_enlarged = 1.5  # largest factor by which photos are enlarged; some networks enlarge small photos
     mismatch = next((camera_size for camera_size in stored if not same_shape(camera_size, size)), None)
     if mismatch is None:
         scaled = [camera_size for camera_size in stored if camera_size != size]
@@ -122,26 +122,20 @@ def list_grids(camera_file: CameraFile, size: Size | None, num_rows: int) -> lis
         return [_mapped_grid(camera_file, size, size, resize_and_crop(size, mismatch))]
     if len(stored) == 1 and stored[0] != size:
         (camera_size,) = stored
-        cameras, transform = to_cameras(camera_file, camera_size), resize_to(size, camera_size)
-        if mismatch is not None:
+        if mismatch is None:
+            grids.append(_grid_of_size(camera_file, size, camera_size, "the cameras' and the Gaussian grid's size"))
+        else:
             crop = resize_and_crop(camera_size, size)
             remark = f"cameras of {camera_size[0]} x {camera_size[1]} are {crop.description}, the images' size"
-            grids.append(Grid(camera_file, crop.cameras(cameras), None, (remark,)))
-        elif max(transform.scale_x, transform.scale_y) > max_enlarged:
-            grids.append(_preview_grid(camera_file, size, camera_size))
-        else:
-            remark = f"photos of {width} x {height} are {transform.description}"
-            remark += ", the cameras' and the Gaussian grid's size"
-            grids.append(Grid(camera_file, cameras, transform, (remark,)))
+            cameras = crop.cameras(to_cameras(camera_file, camera_size))
+            grids.append(Grid(camera_file, cameras, None, (remark,)))
     rows_size = _size_of_rows(size, num_rows, len(camera_file))
     if mismatch is None and rows_size is not None and rows_size not in (size, *stored):
-        transform = resize_to(size, rows_size)
-        if transform.scale_x > max_enlarged:
-            grids.append(_preview_grid(camera_file, size, rows_size))
-        elif transform.scale_x < 1 / max_enlarged:  # rows of a little smaller grid are those of pixels without borders
-            remark = f"photos of {width} x {height} are {transform.description}, the Gaussian grid's size"
-            # before the photos' own size, because rows may hit centres of its pixels, too
-            grids.insert(0, Grid(camera_file, to_cameras(camera_file, rows_size), transform, (remark,)))
+        grid = _grid_of_size(camera_file, size, rows_size, "the Gaussian grid's size")
+        if grid.previews:
+            grids.append(grid)
+        elif MAX_ENLARGED * rows_size[0] < width:  # rows of a little smaller grid are pixels without their borders
+            grids.insert(0, grid)  # before the photos' own size, because rows may hit centres of its pixels, too
     if mismatch is not None:
         found = "{} x {}".format(*mismatch)
         problem = f"expected cameras of the images' size {width} x {height} or a multiple of it, found {found}"
@@ -162,11 +156,17 @@ def _size_of_rows(size: Size, num_rows: int, num_views: int) -> Size | None:
     return (width, height) if is_grid else None
 
 
-def _preview_grid(camera_file: CameraFile, size: Size, grid_size: Size) -> Grid:
-    """Return a grid without photos, because those of ``size`` are much smaller than the grid."""
-    remark = "photos of {} x {} are much smaller than the Gaussian grid of {} x {}, so Gaussians keep their own colours"
-    remarks = (remark.format(*size, *grid_size),)
-    return Grid(camera_file, to_cameras(camera_file, grid_size), None, remarks, previews=True)
+def _grid_of_size(camera_file: CameraFile, size: Size, grid_size: Size, words: str) -> Grid:
+    """Return a grid of another size than the photos' ``size``, to which photos are resized; ``words`` name its size.
+
+    Photos that are much smaller than the grid are previews.
+    """
+    cameras, transform = to_cameras(camera_file, grid_size), resize_to(size, grid_size)
+    photos = "photos of {} x {} are".format(*size)
+    if max(transform.scale_x, transform.scale_y) > MAX_ENLARGED:
+        small = "much smaller than the Gaussian grid of {} x {}, so Gaussians keep their own colours".format(*grid_size)
+        return Grid(camera_file, cameras, None, (f"{photos} {small}",), previews=True)
+    return Grid(camera_file, cameras, transform, (f"{photos} {transform.description}, {words}",))
 
 
 def _mapped_grid(camera_file: CameraFile, size: Size, file_size: Size, file_transform: PhotoTransform) -> Grid:
