@@ -3,42 +3,31 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from gsmerge.errors import Doubt, DoubtWarning, Note, SceneError, count_words, name_notes, split_notes
-from gsmerge.geometry.transforms import move_views
-from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, to_cameras
-from gsmerge.io.cameras.dataparser import read_dataparser
-from gsmerge.io.formats.read_gaussians import GaussianFile, file_notes, read_gaussians, read_parts
-from gsmerge.io.formats.rows import MAX_STRAY, RESULT_COMMENT
+from gsmerge.errors import Doubt, DoubtWarning, SceneError, name_notes, split_notes
+from gsmerge.io.cameras.camera_file import CameraFile, to_cameras
+from gsmerge.io.formats.read_gaussians import GaussianFile, read_gaussians, read_parts
+from gsmerge.io.formats.rows import RESULT_COMMENT
 from gsmerge.io.image_names import IMAGE_PLACES, IMAGE_SUFFIXES, describe_unread
 from gsmerge.io.photo_files import NO_IMAGES, as_floats, photo_size
-from gsmerge.reading.alignment import AlignmentResult, align, check_cameras, check_pixels
-from gsmerge.reading.exporters import (
-    NO_HINTS,
-    ReadHints,
-    choose_exporters,
-    find_cameras_of_model,
-    find_exporter,
-    make_hints,
-)
-from gsmerge.reading.larger_photos import (
-    PhotoSource,
-    find_larger_and_masks,
-    limit_photo_size,
-    limit_view_size,
-    read_scene_cameras,
-)
+from gsmerge.reading.alignment import AlignmentResult, check_cameras, check_pixels
+from gsmerge.reading.exporters import NO_HINTS, ReadHints, find_exporter, make_hints
+from gsmerge.reading.larger_photos import read_scene_cameras
 from gsmerge.reading.loaded import Loaded
+from gsmerge.reading.make_scene import (
+    add_larger_and_masks,
+    check_hints,
+    make_loaded,
+    make_scene,
+    make_scene_without_views,
+)
 from gsmerge.reading.photos.grid_fit import WHOLE_FIT, choose_part, has_bars
-from gsmerge.reading.photos.masks import CameraMaskError, check_masks
 from gsmerge.reading.photos.scene_photos import (
     NO_PHOTOS,
     ScenePhotos,
@@ -53,15 +42,13 @@ from gsmerge.reading.photos.scene_photos import (
     name_by_photos,
     read_photos,
     stored_photos,
-    without_photo,
 )
 from gsmerge.reading.scene_files import SceneFiles, find_scene_files, result_cameras
-from gsmerge.reading.take_gaussians import confirm_colors, take_gaussians
+from gsmerge.reading.take_gaussians import confirm_colors
 from gsmerge.runtime.arguments import check_arguments
-from gsmerge.runtime.record import list_some
 from gsmerge.runtime.threads import use_threads
 from gsmerge.settings.reading import NONE, OpacityChoice
-from gsmerge.types import NO_CAMERAS, Scene, StrPath
+from gsmerge.types import Scene, StrPath
 
 MakeScene = Callable[[CameraFile, ScenePhotos], Loaded]  # may raise SceneError
 SUMMED_FACTS = ("file_bytes", "num_nonfinite")  # facts about files that are added up if scenes are joined
@@ -233,9 +220,9 @@ def align_scene(
         with suppress(SceneError):
             best = _read_without_cameras(ply, files, hints, best, errors, photos=photos)
     if best is not None:
-        return _add_larger_and_masks(confirm_colors(best))
+        return add_larger_and_masks(confirm_colors(best))
     if "cameras" not in files.named:
-        _check_hints(ply, hints)
+        check_hints(ply, hints)
     options = [f"--{name} {NONE}" for name in ("cameras", "images") if name in files.named and getattr(files, name)]
     read_alone = f"{' and '.join(options)} reads the Gaussians alone" if options else ""
     raise SceneError(errors[0].path, errors[0].problem, "; ".join(filter(None, (errors[0].remedy, read_alone))))
@@ -272,7 +259,7 @@ def _read_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints, *, photo
     """
     camera_file = read_scene_cameras(ply, files)
     if camera_file is None:
-        return _make_scene_without_views(ply, files, hints)
+        return make_scene_without_views(ply, files, hints)
     found, errors = NO_PHOTOS, Errors()
     with errors:
         found = find_photos(files, camera_file) if photos else NO_PHOTOS
@@ -280,14 +267,14 @@ def _read_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints, *, photo
         raise errors[0]
     if found.by_names:
         files = replace(files, images=found.folder)
-    make_scene = partial(_make_scene_with_views, ply, files, hints)
+    make = partial(make_scene, ply, files, hints)
     if found.named:
         with errors:
             cameras, proposed, doubts = keep_one_shape(camera_file, found)
-            load = _make_with_photos(make_scene, cameras, proposed)
+            load = _make_with_photos(make, cameras, proposed)
             return replace(load, notes=(*load.notes, *doubts))
     if not errors:  # there are no photos, or they are in one file
-        load = make_scene(camera_file, found)
+        load = make(camera_file, found)
         lacks_photos = photos and "images" not in files.named and load.scene.images is None
         is_result = RESULT_COMMENT in ply.info.comments or result_cameras(files.ply)  # films beside a result show it
         notes_on_films = describe_unread(files.ply.parent, IMAGE_PLACES) if lacks_photos and not is_result else []
@@ -297,14 +284,14 @@ def _read_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints, *, photo
         are_blamed = "cameras" not in files.named and cause.path == camera_file.path
         raise explain_mismatch(found, camera_file) if are_blamed else cause
     with errors:
-        bare = make_scene(camera_file, NO_PHOTOS)
+        bare = make(camera_file, NO_PHOTOS)
     is_photo = Path(cause.path).suffix.lower() in IMAGE_SUFFIXES or cause.path == str(folder) or not found.named
     if bare is None or not (bare.scene.has_own_pixels or is_photo or found.by_names):
         raise cause
     return _note_left_out(bare, replace(files, images=folder), [f"the photos in {folder}"], cause)
 
 
-def _make_with_photos(make_scene: MakeScene, camera_file: CameraFile, photos: ScenePhotos) -> Loaded:
+def _make_with_photos(make: MakeScene, camera_file: CameraFile, photos: ScenePhotos) -> Loaded:
     """Make a scene with the photos that names propose, or with other photos that show its views.
 
     1. If the photos have another shape than the cameras, parts of the photos are used if they show the views.
@@ -320,19 +307,19 @@ def _make_with_photos(make_scene: MakeScene, camera_file: CameraFile, photos: Sc
     parts, base, errors = None, None, Errors()
     if shapes_differ:
         with suppress(SceneError):
-            parts = choose_part(make_scene(pinholes, NO_PHOTOS).scene, photos, camera_file)
+            parts = choose_part(make(pinholes, NO_PHOTOS).scene, photos, camera_file)
         if parts is not None:
-            return _make_with_photos(make_scene, camera_file, parts)
+            return _make_with_photos(make, camera_file, parts)
     # 2. The base: the scene with the proposed photos, or without photos
     if any(photos.named) and not has_no_names:
         with errors:
             read = read_photos(photos, camera_file)
-            base = make_scene(camera_file, read)
+            base = make(camera_file, read)
             photos = photos.without_files(read.damaged)
     are_read = base is not None
     if base is None:
         with errors:
-            base = make_scene(pinholes, NO_PHOTOS)
+            base = make(pinholes, NO_PHOTOS)
     if base is None:
         raise errors[0]
     # 3. The photo of each view, whole or in part
@@ -341,7 +328,7 @@ def _make_with_photos(make_scene: MakeScene, camera_file: CameraFile, photos: Sc
     if not show_most and photos.fit == WHOLE_FIT and not shapes_differ:
         parts = choose_part(base.scene, photos, camera_file, checked.grid_fit)
         if parts is not None:
-            return _make_with_photos(make_scene, camera_file, parts)
+            return _make_with_photos(make, camera_file, parts)
     if not any(checked.paths) or (shapes_differ and not checked.explain_most):
         # an error of photos of another shape says nothing, unless lenses may have changed the shape
         if errors and (not shapes_differ or any(camera_file.lenses)):
@@ -350,7 +337,7 @@ def _make_with_photos(make_scene: MakeScene, camera_file: CameraFile, photos: Sc
     # 4. The scene with the photos of its views, unless the same photos were proposed
     load = base
     if not are_read or (checked.paths, checked.turns) != (photos.paths, photos.turns):
-        load = make_scene(name_by_photos(camera_file, checked), read_photos(checked, camera_file))
+        load = make(name_by_photos(camera_file, checked), read_photos(checked, camera_file))
     described = describe_assignment(checked, camera_file, are_pixels=base.scene.has_own_pixels)
     return replace(load, notes=(*checked.notes, *load.notes, *described), photos_explain=checked.explain_most)
 
@@ -372,148 +359,6 @@ def _note_left_out(load: Loaded, files: SceneFiles, left_out: list[str], cause: 
     return replace(load, notes=(Doubt(" ".join(doubt.split())), *notes))
 
 
-def _make_scene_with_views(
-    ply: GaussianFile, files: SceneFiles, hints: ReadHints, camera_file: CameraFile, photos: ScenePhotos
-) -> Loaded:
-    """Combine Gaussians, cameras and photos. Raises SceneError if the cameras or the photos cannot be used."""
-    # the order of the rows is that of the hints, of the named exporter, or of the format of the cameras
-    order: str = hints.order
-    if order == "auto":
-        order = (find_exporter(hints.exporter) or camera_file).order
-        if order == "auto" and RESULT_COMMENT in ply.info.comments:
-            order = "none"  # results have no pixels
-    pinholes, pictures, notes = as_pinholes(camera_file, photos.pictures)
-    limited, size_notes = limit_photo_size(pictures, len(ply.gaussians), hints.max_side, unaligned=order == "none")
-    if files.is_state and files.cameras == files.ply:  # the cameras of a state fit its Gaussians, so none are aligned
-        problem = "expected one Gaussian per pixel, found the Gaussians of a state"
-        cameras = to_cameras(pinholes, photo_size(limited))
-        result = AlignmentResult(None, cameras, as_floats(limited), pinholes, problem=problem)
-    else:
-        frames = partial(read_dataparser, files.ply, files.cameras)
-        result = align(ply, pinholes, limited, order=order, scale=hints.scene_scale, frames=frames)
-    photos = photos.without_files(photos.damaged)  # now that all photos were decoded
-    notes += [*size_notes, *result.notes]
-    if result.pixel_ids is None:
-        _check_hints(ply, hints)
-        cameras, images, size_notes = limit_view_size(result.cameras, result.images, hints.max_side)
-        result = replace(result, cameras=cameras, images=images)
-        notes += size_notes
-    source = PhotoSource(camera_file, photos, photo_size(limited), result.transform)
-    return _make_loaded(ply, files, hints, result, notes, source)
-
-
-def _add_larger_and_masks(load: Loaded) -> Loaded:
-    """Add larger photos and masks to a scene whose cameras and photos are decided.
-
-    Masks that were found, but cannot be used, are left out with a note. Raises SceneError for masks that the caller
-    named, and for masks that the camera file lists if they are photos.
-    """
-    files, source, scene, notes = load.files, load.source, load.scene, list[str]()
-    if source is None:
-        return load
-    mask_options = [name for name in ("masks", "protect") if getattr(files, name) is not None]
-    if mask_options and not source.size:
-        text = f"the pictures of --{' and --'.join(mask_options)} are not used, since there are no photos"
-        notes.append(Doubt(text) if files.named.intersection(mask_options) else text)
-    is_plain = "masks" in files.named and files.masks is None  # the user wants no masks
-    try:
-        large, masks, mask_notes = find_larger_and_masks(files, source, scene.cameras, is_plain=is_plain)
-    except SceneError as error:
-        is_protecting = files.protect is not None and Path(error.path).is_relative_to(files.protect)
-        is_listed = isinstance(error, CameraMaskError) or Path(error.path) in source.photos.paths
-        if "masks" in files.named or is_protecting or is_listed:
-            raise
-        remedy = error.remedy or f"pass --masks FOLDER, or --masks {NONE}"
-        notes.append(Doubt(f"masks are left out: {error.path}: {error.problem}; {remedy}"))
-        without_masks = replace(files, masks=None, named=files.named | {"masks"})
-        large, masks, mask_notes = find_larger_and_masks(without_masks, source, scene.cameras)
-    masks, check_notes = check_masks(masks, files, scene)
-    counts = masks.counts
-    if scene.masks is not None:  # some views have no photo, and none of their pixels count
-        counts = scene.masks if counts is None else counts & scene.masks
-    maps = source.camera_file.depths  # of the model, which saw the views at their own size
-    depths = (
-        maps if maps is not None and maps.shape == (len(scene), scene.cameras.height, scene.cameras.width) else None
-    )
-    scene = replace(scene, large_photos=large, masks=counts, importance=masks.importance, depths=depths)
-    return replace(load, scene=scene, source=None, notes=(*load.notes, *notes, *mask_notes, *check_notes))
-
-
-def _make_scene_without_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> Loaded:
-    """Make a scene without views; a run places views later. A note says that photos are not used."""
-    advice = find_cameras_of_model(ply.info)
-    notes = [advice] if advice else []
-    _check_hints(ply, hints)
-    if files.images is not None:
-        reason = (
-            f"only cameras show which views they have, and --cameras {NONE} leaves cameras out"
-            if "cameras" in files.named
-            else "there are no cameras, such as a transforms.json or a COLMAP model; name them with --cameras"
-        )
-        notes += [Note(f"the photos in {files.images} are not used: {reason}", "unused photos")]
-    problem = "expected one Gaussian per pixel, found no cameras"
-    return _make_loaded(ply, files, hints, AlignmentResult(None, NO_CAMERAS, NO_IMAGES, None, problem=problem), notes)
-
-
-def _check_hints(ply: GaussianFile, hints: ReadHints) -> None:
-    """For rows that have no pixels, raise SceneError if a hint says that rows are pixels."""
-    if hints.order not in ("auto", "none"):
-        problem = f"expected rows that are pixels of views, as --hint order={hints.order} says, found others"
-        raise SceneError(ply.info.path, problem, "leave the hint out, or name the cameras that fit with --cameras")
-
-
-def _make_loaded(
-    ply: GaussianFile,
-    files: SceneFiles,
-    hints: ReadHints,
-    result: AlignmentResult,
-    notes: Sequence[str],
-    source: PhotoSource | None = None,
-) -> Loaded:
-    """Make a scene of the visible Gaussians and all views, with all facts about how it was read.
-
-    ``result`` has the cameras, the photos, and the pixels of the rows. ``source`` has the photos as stored; the scene
-    has no larger photos and no masks yet, see :func:`_add_larger_and_masks`.
-    """
-    absent = [] if source is None else source.photos.absent
-    camera_file, recovery = result.camera_file, result.recovery
-    gaussians, pixels = take_gaussians(ply, result)
-    num_faint = int(ply.valid.sum()) - len(gaussians)
-    faint = count_words(num_faint, "Gaussian", "fainter than 1/255, which nothing draws, set aside")
-    photos = result.images if len(result.images) else None
-    names = () if camera_file is None else camera_file.names
-    cameras = replace(result.cameras, antialiased=ply.info.antialiased)
-    scene = Scene(gaussians, cameras, photos, pixels, names)
-    last_rows = () if pixels is None else pixels.fronts.max((1, 2))  # -1 for a view without rows
-    empty_views = [scene.names[view] for view, row in enumerate(last_rows) if row < 0 and view not in absent]
-    views_have = f"{len(empty_views)} of {len(scene)} views {'has' if len(empty_views) == 1 else 'have'}"
-    doubts = [Doubt(f"{views_have} no Gaussians: {list_some(empty_views)}")] if empty_views else []
-    if hints.quats != "wxyz":
-        scene = replace(scene, gaussians=replace(scene.gaussians, quats=np.roll(scene.gaussians.quats, 1, axis=1)))
-    if recovery is not None and result.confirmed_viewmats is not None:
-        scene = move_views(scene, result.confirmed_viewmats)
-    alignment = None if recovery is None else check_pixels(scene)
-    if alignment is not None and alignment.share_near < 1 - MAX_STRAY:
-        share = f"{100 * (1 - alignment.share_near):.0f} % of the Gaussians lie far from their own pixels"
-        doubts.append(Doubt(f"{share}, as rows of a damaged file do; copy or export it again"))
-    format_name = "" if camera_file is None else camera_file.source
-    order = "none" if recovery is None else recovery.layout.order
-    return Loaded(
-        scene=without_photo(scene, absent) if absent else scene,
-        info=ply.info,
-        files=files,
-        cameras=camera_file,
-        exporters=choose_exporters(hints.exporter, ply.info, order, format_name),
-        notes=(*files.notes, *file_notes(ply.info), *doubts, *notes, *([faint] if num_faint else [])),
-        alignment=alignment,
-        recovery=recovery,
-        problem=result.problem,
-        moves=result.moves,
-        own_views=result.own_views,
-        source=source,
-    )
-
-
 def move_cameras_to_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHints, photos: bool) -> Loaded:
     """Read a scene with its cameras moved into the frame of the Gaussians, if pixels or colours show that frame.
 
@@ -533,5 +378,5 @@ def move_cameras_to_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHi
             if "cameras" in files.named or check_cameras(ply.gaussians, ply.valid, cameras, NO_IMAGES).ok:
                 doubt = Doubt("the cameras do not fit the Gaussians; they stay as stored in their file")
                 as_stored = AlignmentResult(None, cameras, as_floats(pictures), camera_file)
-                return replace(_make_loaded(ply, files, hints, as_stored, [doubt]), cameras=None)
+                return replace(make_loaded(ply, files, hints, as_stored, [doubt]), cameras=None)
     return align_scene(ply, files, hints=hints, photos=photos)  # this leaves out files that were not named

@@ -1,0 +1,171 @@
+"""Make a scene of Gaussians, cameras and photos that were read, with all facts about how they were read."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from gsmerge.errors import Doubt, Note, SceneError, count_words
+from gsmerge.geometry.transforms import move_views
+from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, to_cameras
+from gsmerge.io.cameras.dataparser import read_dataparser
+from gsmerge.io.formats.read_gaussians import GaussianFile, file_notes
+from gsmerge.io.formats.rows import MAX_STRAY, RESULT_COMMENT
+from gsmerge.io.photo_files import NO_IMAGES, as_floats, photo_size
+from gsmerge.reading.alignment import AlignmentResult, align, check_pixels
+from gsmerge.reading.exporters import ReadHints, choose_exporters, find_cameras_of_model, find_exporter
+from gsmerge.reading.larger_photos import PhotoSource, find_larger_and_masks, limit_photo_size, limit_view_size
+from gsmerge.reading.loaded import Loaded
+from gsmerge.reading.photos.masks import CameraMaskError, check_masks
+from gsmerge.reading.photos.scene_photos import ScenePhotos, without_photo
+from gsmerge.reading.scene_files import SceneFiles
+from gsmerge.reading.take_gaussians import take_gaussians
+from gsmerge.runtime.record import list_some
+from gsmerge.settings.reading import NONE
+from gsmerge.types import NO_CAMERAS, Scene
+
+
+def make_scene(
+    ply: GaussianFile, files: SceneFiles, hints: ReadHints, camera_file: CameraFile, photos: ScenePhotos
+) -> Loaded:
+    """Combine Gaussians, cameras and photos. Raises SceneError if the cameras or the photos cannot be used."""
+    # the order of the rows is that of the hints, of the named exporter, or of the format of the cameras
+    order: str = hints.order
+    if order == "auto":
+        order = (find_exporter(hints.exporter) or camera_file).order
+        if order == "auto" and RESULT_COMMENT in ply.info.comments:
+            order = "none"  # results have no pixels
+    pinholes, pictures, notes = as_pinholes(camera_file, photos.pictures)
+    limited, size_notes = limit_photo_size(pictures, len(ply.gaussians), hints.max_side, unaligned=order == "none")
+    if files.is_state and files.cameras == files.ply:  # the cameras of a state fit its Gaussians, so none are aligned
+        problem = "expected one Gaussian per pixel, found the Gaussians of a state"
+        cameras = to_cameras(pinholes, photo_size(limited))
+        result = AlignmentResult(None, cameras, as_floats(limited), pinholes, problem=problem)
+    else:
+        frames = partial(read_dataparser, files.ply, files.cameras)
+        result = align(ply, pinholes, limited, order=order, scale=hints.scene_scale, frames=frames)
+    photos = photos.without_files(photos.damaged)  # now that all photos were decoded
+    notes += [*size_notes, *result.notes]
+    if result.pixel_ids is None:
+        check_hints(ply, hints)
+        cameras, images, size_notes = limit_view_size(result.cameras, result.images, hints.max_side)
+        result = replace(result, cameras=cameras, images=images)
+        notes += size_notes
+    source = PhotoSource(camera_file, photos, photo_size(limited), result.transform)
+    return make_loaded(ply, files, hints, result, notes, source)
+
+
+def make_scene_without_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> Loaded:
+    """Make a scene without views; a run places views later. A note says that photos are not used."""
+    advice = find_cameras_of_model(ply.info)
+    notes = [advice] if advice else []
+    check_hints(ply, hints)
+    if files.images is not None:
+        reason = (
+            f"only cameras show which views they have, and --cameras {NONE} leaves cameras out"
+            if "cameras" in files.named
+            else "there are no cameras, such as a transforms.json or a COLMAP model; name them with --cameras"
+        )
+        notes += [Note(f"the photos in {files.images} are not used: {reason}", "unused photos")]
+    problem = "expected one Gaussian per pixel, found no cameras"
+    return make_loaded(ply, files, hints, AlignmentResult(None, NO_CAMERAS, NO_IMAGES, None, problem=problem), notes)
+
+
+def make_loaded(
+    ply: GaussianFile,
+    files: SceneFiles,
+    hints: ReadHints,
+    result: AlignmentResult,
+    notes: Sequence[str],
+    source: PhotoSource | None = None,
+) -> Loaded:
+    """Make a scene of the visible Gaussians and all views, with all facts about how it was read.
+
+    ``result`` has the cameras, the photos, and the pixels of the rows. ``source`` has the photos as stored; the scene
+    has no larger photos and no masks yet, see :func:`add_larger_and_masks`.
+    """
+    absent = [] if source is None else source.photos.absent
+    camera_file, recovery = result.camera_file, result.recovery
+    gaussians, pixels = take_gaussians(ply, result)
+    num_faint = int(ply.valid.sum()) - len(gaussians)
+    faint = count_words(num_faint, "Gaussian", "fainter than 1/255, which nothing draws, set aside")
+    photos = result.images if len(result.images) else None
+    names = () if camera_file is None else camera_file.names
+    cameras = replace(result.cameras, antialiased=ply.info.antialiased)
+    scene = Scene(gaussians, cameras, photos, pixels, names)
+    last_rows = () if pixels is None else pixels.fronts.max((1, 2))  # -1 for a view without rows
+    empty_views = [scene.names[view] for view, row in enumerate(last_rows) if row < 0 and view not in absent]
+    views_have = f"{len(empty_views)} of {len(scene)} views {'has' if len(empty_views) == 1 else 'have'}"
+    doubts = [Doubt(f"{views_have} no Gaussians: {list_some(empty_views)}")] if empty_views else []
+    if hints.quats != "wxyz":
+        scene = replace(scene, gaussians=replace(scene.gaussians, quats=np.roll(scene.gaussians.quats, 1, axis=1)))
+    if recovery is not None and result.confirmed_viewmats is not None:
+        scene = move_views(scene, result.confirmed_viewmats)
+    alignment = None if recovery is None else check_pixels(scene)
+    if alignment is not None and alignment.share_near < 1 - MAX_STRAY:
+        share = f"{100 * (1 - alignment.share_near):.0f} % of the Gaussians lie far from their own pixels"
+        doubts.append(Doubt(f"{share}, as rows of a damaged file do; copy or export it again"))
+    format_name = "" if camera_file is None else camera_file.source
+    order = "none" if recovery is None else recovery.layout.order
+    return Loaded(
+        scene=without_photo(scene, absent) if absent else scene,
+        info=ply.info,
+        files=files,
+        cameras=camera_file,
+        exporters=choose_exporters(hints.exporter, ply.info, order, format_name),
+        notes=(*files.notes, *file_notes(ply.info), *doubts, *notes, *([faint] if num_faint else [])),
+        alignment=alignment,
+        recovery=recovery,
+        problem=result.problem,
+        moves=result.moves,
+        own_views=result.own_views,
+        source=source,
+    )
+
+
+def check_hints(ply: GaussianFile, hints: ReadHints) -> None:
+    """For rows that have no pixels, raise SceneError if a hint says that rows are pixels."""
+    if hints.order not in ("auto", "none"):
+        problem = f"expected rows that are pixels of views, as --hint order={hints.order} says, found others"
+        raise SceneError(ply.info.path, problem, "leave the hint out, or name the cameras that fit with --cameras")
+
+
+def add_larger_and_masks(load: Loaded) -> Loaded:
+    """Add larger photos and masks to a scene whose cameras and photos are decided.
+
+    Masks that were found, but cannot be used, are left out with a note. Raises SceneError for masks that the caller
+    named, and for masks that the camera file lists if they are photos.
+    """
+    files, source, scene, notes = load.files, load.source, load.scene, list[str]()
+    if source is None:
+        return load
+    mask_options = [name for name in ("masks", "protect") if getattr(files, name) is not None]
+    if mask_options and not source.size:
+        text = f"the pictures of --{' and --'.join(mask_options)} are not used, since there are no photos"
+        notes.append(Doubt(text) if files.named.intersection(mask_options) else text)
+    is_plain = "masks" in files.named and files.masks is None  # the user wants no masks
+    try:
+        large, masks, mask_notes = find_larger_and_masks(files, source, scene.cameras, is_plain=is_plain)
+    except SceneError as error:
+        is_protecting = files.protect is not None and Path(error.path).is_relative_to(files.protect)
+        is_listed = isinstance(error, CameraMaskError) or Path(error.path) in source.photos.paths
+        if "masks" in files.named or is_protecting or is_listed:
+            raise
+        remedy = error.remedy or f"pass --masks FOLDER, or --masks {NONE}"
+        notes.append(Doubt(f"masks are left out: {error.path}: {error.problem}; {remedy}"))
+        without_masks = replace(files, masks=None, named=files.named | {"masks"})
+        large, masks, mask_notes = find_larger_and_masks(without_masks, source, scene.cameras)
+    masks, check_notes = check_masks(masks, files, scene)
+    counts = masks.counts
+    if scene.masks is not None:  # some views have no photo, and none of their pixels count
+        counts = scene.masks if counts is None else counts & scene.masks
+    maps = source.camera_file.depths  # of the model, which saw the views at their own size
+    depths = (
+        maps if maps is not None and maps.shape == (len(scene), scene.cameras.height, scene.cameras.width) else None
+    )
+    scene = replace(scene, large_photos=large, masks=counts, importance=masks.importance, depths=depths)
+    return replace(load, scene=scene, source=None, notes=(*load.notes, *notes, *mask_notes, *check_notes))
