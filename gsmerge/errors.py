@@ -7,13 +7,17 @@ exceptions; the command line prints the message of an exception as one line.
 from __future__ import annotations
 
 import errno
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from copy import copy
 from os import PathLike
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ParamSpec, TypeVar
 
 if TYPE_CHECKING:
     from typing_extensions import Self
+
+Arguments = ParamSpec("Arguments")
+Result = TypeVar("Result")
 
 
 class GsmergeError(Exception):
@@ -56,9 +60,19 @@ class SceneError(GsmergeError):
         self.path, self.problem, self.remedy = str(path), problem, remedy
         super().__init__(f"{self.path}: {problem}" + (f"; {remedy}" if remedy else ""))
 
-    def __reduce__(self) -> tuple[type[SceneError], tuple[str, str, str]]:
-        """Pickle the arguments, so that processes can send this error to each other."""
-        return type(self), (self.path, self.problem, self.remedy)
+    def __reduce__(self) -> tuple[type[SceneError], tuple[str, str, str], dict[str, object]]:
+        """Pickle the arguments and all attributes, so that processes can send this error to each other."""
+        return type(self), (self.path, self.problem, self.remedy), vars(self)
+
+
+def attempt(
+    call: Callable[Arguments, Result], *arguments: Arguments.args, **named: Arguments.kwargs
+) -> Result | SceneError:
+    """Return what a call returns, or the SceneError that it raises."""
+    try:
+        return call(*arguments, **named)
+    except SceneError as error:
+        return copy(error)  # without its traceback, which keeps arrays
 
 
 class DoubtWarning(UserWarning):

@@ -10,7 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from gsmerge.errors import Doubt, SceneError, UsageError, count_words
+from gsmerge.errors import Doubt, SceneError, UsageError, attempt, count_words
 from gsmerge.io import SCENE_SUFFIXES, read_cameras
 from gsmerge.io.bounds import read_errors, walk_files
 from gsmerge.io.cameras.dataparser import DATAPARSER
@@ -86,10 +86,9 @@ def list_files(files: SceneFiles) -> list[Path]:
 
 def list_photos(files: SceneFiles, cameras: Path) -> list[Path]:
     """List the photos that may show the views of a camera file, and the masks that the camera file names."""
-    try:
-        camera_file = read_cameras(cameras)
-        photos = find_photos(files, camera_file)
-    except SceneError:  # the reader of the scene reports it
+    camera_file = attempt(read_cameras, cameras)
+    photos = camera_file if isinstance(camera_file, SceneError) else attempt(find_photos, files, camera_file)
+    if isinstance(camera_file, SceneError) or isinstance(photos, SceneError):  # the reader of the scene reports it
         return []
     root = cameras if cameras.is_dir() else cameras.parent
     masks = [root / name for name in camera_file.masks.values() if (root / name).is_file()]

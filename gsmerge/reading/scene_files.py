@@ -11,7 +11,7 @@ from contextlib import suppress
 from itertools import islice, pairwise
 from pathlib import Path
 
-from gsmerge.errors import SceneError
+from gsmerge.errors import SceneError, attempt
 from gsmerge.frozen import dataclass, replace
 from gsmerge.io.bounds import check_file
 from gsmerge.io.cameras.foreign import check_program, find_unread
@@ -321,7 +321,9 @@ def _find_above(files: SceneFiles, roots: Sequence[Path]) -> tuple[tuple[str, Pa
     # The uppermost folder is found by ``min``, since the path of a folder sorts before the paths in it
     folder = min(filter(Path(os.path.realpath(files.ply)).is_relative_to, roots), default=roots[0]).parent
     places = dict[str, Path | None]()
-    with suppress(SceneError, OSError):
+
+    def search() -> None:
+        """Search the folder; raise SceneError or OSError if something in it cannot be read."""
         if files.images is None and "images" not in files.named:
             places["images"] = _find_pictures("images", IMAGE_PLACES, [folder], files.ply)
         if files.cameras is None and "cameras" not in files.named:
@@ -332,6 +334,9 @@ def _find_above(files: SceneFiles, roots: Sequence[Path]) -> tuple[tuple[str, Pa
         if masks and files.images and files.masks is None and "masks" not in files.named:
             match_masks(masks, [*map(str, list_images(files.images))])  # SceneError if no mask has the name of a photo
             places["masks"] = masks
+
+    with suppress(OSError):
+        attempt(search)
     return tuple((option, path) for option, path in places.items() if path is not None and path not in roots)
 
 
@@ -515,15 +520,12 @@ def _order_parts(folder: Path, plys: Sequence[Path], cameras: Path | None) -> li
     elif plys[0].parent.name == SCENES_PLACE or cameras is None or len({header_counts(path) for path in plys}) > 1:
         return None
     else:
-        num_cameras = 0
-        with suppress(SceneError):
-            num_cameras = len(read_cameras(cameras))
-        if num_cameras != len(plys):
+        stored = attempt(read_cameras, cameras)
+        if isinstance(stored, SceneError) or len(stored) != len(plys):
             return None
-    for path in plys:
-        with suppress(SceneError):  # the reader of the file reports a damaged camera
-            if read_sharp_camera(path) is not None:
-                return None
+    inside = (attempt(read_sharp_camera, path) for path in plys)  # the reader of a file reports a damaged camera
+    if any(not isinstance(camera, SceneError | None) for camera in inside):
+        return None
     return [path_of[number] for number in numbers]
 
 

@@ -16,6 +16,7 @@ from gsmerge.errors import (
     SceneError,
     TargetError,
     UsageError,
+    attempt,
     count_words,
     list_doubts,
     name_notes,
@@ -33,6 +34,19 @@ def test_errors_can_be_pickled(error: GsmergeError) -> None:
     assert type(copy) is type(error)
     assert str(copy) == str(error)
     assert vars(copy) == vars(error)
+
+
+def test_an_attempt_returns_a_result_or_the_error_of_a_scene() -> None:
+    def refuse(path: str, *, problem: str) -> None:
+        raise SceneError(path, problem, "name another")
+
+    assert attempt(int, "3") == 3
+    error = attempt(refuse, "a.ply", problem="expected rows, found none")
+    assert isinstance(error, SceneError)
+    assert (error.path, error.remedy) == ("a.ply", "name another")
+    assert error.__traceback__ is None  # it would keep the arrays of the functions that were called
+    with pytest.raises(ValueError, match="invalid literal"):
+        attempt(int, "three")
 
 
 def test_advice_for_all_commands_names_no_option() -> None:

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from gsmerge.errors import Note, SceneError
+from gsmerge.errors import Note, SceneError, attempt
 from gsmerge.frozen import dataclass, replace
 from gsmerge.geometry.transforms import IDENTITY, Similarity, median
 from gsmerge.io.cameras.camera_file import CameraFile
@@ -153,10 +153,10 @@ def align(
         recovery = _recover_pixels(source, grid)
         if recovery is not None:
             return _make_alignment(source, recovery)
-    try:
-        return _align_without_pixels(source, grids[0], frames)
-    except SceneError as error:
-        raise grids[0].mismatch or error from error
+    result = attempt(_align_without_pixels, source, grids[0], frames)
+    if isinstance(result, SceneError):
+        raise grids[0].mismatch or result
+    return result
 
 
 def _recover_pixels(source: RowSource, grid: Grid) -> Recovery | None:

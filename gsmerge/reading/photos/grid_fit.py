@@ -9,13 +9,12 @@ one by which photos best match the pictures of the Gaussians.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
 from itertools import product
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from gsmerge.errors import SceneError
+from gsmerge.errors import SceneError, attempt
 from gsmerge.frozen import dataclass, replace
 from gsmerge.geometry.views import pick_views
 from gsmerge.io.cameras.camera_file import CameraFile, sizes_of
@@ -233,12 +232,12 @@ def choose_part(
     def read(number: int) -> tuple[np.ndarray, np.ndarray]:
         """Return a small photo, and the shares of its sides (left, above, right, below) that are bars."""
         size = sizes[number]
-        with suppress(SceneError):
-            whole = decode_image(paths[number], size)
-            above, below, left, right = count_bars(whole, BAR_SPREAD)
-            small = resize_to(size, limit_size(size, 4 * OFFSET_PIXELS)).photos([whole])[0]
-            return small / np.float32(255), np.array([left, above, right, below]) / (size * 2)
-        return np.zeros((OFFSET_PIXELS, OFFSET_PIXELS, 3), np.float32), np.zeros(4)
+        whole = attempt(decode_image, paths[number], size)
+        if isinstance(whole, SceneError):
+            return np.zeros((OFFSET_PIXELS, OFFSET_PIXELS, 3), np.float32), np.zeros(4)
+        above, below, left, right = count_bars(whole, BAR_SPREAD)
+        small = resize_to(size, limit_size(size, 4 * OFFSET_PIXELS)).photos([whole])[0]
+        return small / np.float32(255), np.array([left, above, right, below]) / (size * 2)
 
     pictures, bars = zip(*parallel_map(read, range(len(paths))), strict=True)
     left, above, right, below = np.median(bars, 0).tolist()

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from gsmerge.errors import Doubt, SceneError
+from gsmerge.errors import Doubt, SceneError, attempt
 from gsmerge.frozen import dataclass, field, replace
 from gsmerge.io.cameras.camera_file import CameraFile, select_views, sizes_of
 from gsmerge.io.cameras.programs import SHARP
@@ -249,18 +249,14 @@ def find_named_photos(
 
 def is_grey(path: Path) -> bool:
     """Return True if an image file has no colours, like masks and depths; False if it cannot be read."""
-    with suppress(SceneError):
-        return bool(np.ptp(decode_small(path, OFFSET_PIXELS), axis=-1).mean() <= _CHANNEL_ROUNDING)
-    return False
+    small = attempt(decode_small, path, OFFSET_PIXELS)
+    return not isinstance(small, SceneError) and bool(np.ptp(small, axis=-1).mean() <= _CHANNEL_ROUNDING)
 
 
 def count_pixels(path: Path) -> int:
     """Count the pixels of an image file; 0 if it cannot be read."""
-    try:
-        width, height = image_size(path)
-    except SceneError:
-        return 0
-    return width * height
+    size = attempt(image_size, path)
+    return 0 if isinstance(size, SceneError) else size[0] * size[1]
 
 
 def _describe_missing_file(folder: Path, name: str) -> str:
@@ -278,11 +274,10 @@ def _describe_missing_file(folder: Path, name: str) -> str:
 
 def _check_header(path: Path) -> str | None:
     """Return why the header of an image file cannot be read; None if it can be read."""
-    try:
-        image_size(path)
-    except SceneError as error:
-        return f"{error.problem}; {CONVERT}" if error.remedy == CONVERT else error.problem
-    return None
+    size = attempt(image_size, path)
+    if not isinstance(size, SceneError):
+        return None
+    return f"{size.problem}; {CONVERT}" if size.remedy == CONVERT else size.problem
 
 
 def stored_photos(files: SceneFiles, camera_file: CameraFile) -> PhotoArrays:
@@ -387,11 +382,10 @@ def _list_candidates(photos: ScenePhotos) -> Candidates:
 
     def read(number: int) -> np.ndarray:
         """Read a small version of a photo, and cut out the part that is used."""
-        small = np.zeros((OFFSET_PIXELS, OFFSET_PIXELS, 3), np.float32)
-        with suppress(SceneError):
-            path = photos.pool[number]
-            small = extend_picture(decode_small(path, OFFSET_PIXELS), photos.canvas, image_size(path))
-        small = photos.fit.cut(small)
+        path = photos.pool[number]
+        read = attempt(lambda: extend_picture(decode_small(path, OFFSET_PIXELS), photos.canvas, image_size(path)))
+        black = np.zeros((OFFSET_PIXELS, OFFSET_PIXELS, 3), np.float32)
+        small = photos.fit.cut(black if isinstance(read, SceneError) else read)
         return small if photos.grid_fit is None else photos.grid_fit.cut(small)
 
     return Candidates(read, len(photos.pool), lambda number: orientation_turn(photos.pool[number]))
