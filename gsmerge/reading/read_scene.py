@@ -27,7 +27,8 @@ from gsmerge.reading.make_scene import (
     make_scene,
     make_scene_without_views,
 )
-from gsmerge.reading.photos.grid_fit import WHOLE_FIT, choose_part, has_bars
+from gsmerge.reading.photos.grid_fit import WHOLE_FIT
+from gsmerge.reading.photos.photo_parts import choose_part, has_bars
 from gsmerge.reading.photos.scene_photos import (
     NO_PHOTOS,
     ScenePhotos,
