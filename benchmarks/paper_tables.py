@@ -26,7 +26,7 @@ from gsmerge.geometry.views import even_views, midpoint_views, pick_views, subse
 from gsmerge.networks.checkpoint import IN_PACKAGE, load_checkpoint, save_checkpoint
 from gsmerge.networks.options import SLOTS
 from gsmerge.reading.held_out import HeldOutViews, read_held_out
-from gsmerge.reading.read_scene import load_files
+from gsmerge.reading.read_scene import read_files
 from gsmerge.reading.scene_files import find_scene_files
 from gsmerge.research.charts.lines import Interval, mean_interval
 from gsmerge.scoring.evaluate import EvaluateOptions, evaluate, near_plane
@@ -133,7 +133,7 @@ def write_silenced(checkpoint: Path, name: str, folder: Path) -> Path:
 @lru_cache(maxsize=1)
 def load_case(ply: Path, targets: Path) -> tuple[gsmerge.Scene, HeldOutViews]:
     """Read a scene, and its held-out views in the world of the export."""
-    load = load_files(find_scene_files(ply))
+    load = read_files(find_scene_files(ply))
     return load.scene, read_held_out(load, targets)
 
 

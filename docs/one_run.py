@@ -40,7 +40,7 @@ ROW = (VIEW * HEIGHT + Y) * WIDTH + X  # row of this pixel's Gaussian
 LINE = 120  # most characters of a line of the page
 DIAGONAL = ([0, 1, 2], [0, 1, 2])  # indices of the diagonal of a matrix [3,3]
 WATCHED = {  # functions that are recorded, by the module that calls them
-    "gsmerge.reading.make_scene": ("align",),
+    "gsmerge.reading.make_scene": ("find_pixels",),
     "gsmerge.road": ("make_plan", "build", "make_result"),
     "gsmerge.pipeline": ("segment_scene", "correct", "match", "merge", "decode_merged", "fit_scene"),
 }
@@ -244,13 +244,13 @@ def head(run: Run) -> list[str]:
 
 def values_table(run: Run) -> str:
     """Write the table of arrays, in the order of the steps."""
-    made, prepared, ply = run.made, run.prepared, run.arguments["align"][0]
+    made, prepared, ply = run.made, run.prepared, run.arguments["find_pixels"][0]
     features, merged, fitted = made["correct"], made["merge"], made["fit_scene"]
     return "\n".join([
         "| function | array | row |",
         "|---|---|---|",
-        entry("align", "ply.gaussians.means", ply.gaussians.means, ROW),
-        entry("align", "pixel_ids", made["align"].pixel_ids, ROW),
+        entry("find_pixels", "ply.gaussians.means", ply.gaussians.means, ROW),
+        entry("find_pixels", "pixel_ids", made["find_pixels"].pixel_ids, ROW),
         entry("prepare", "scene.gaussians.means", prepared.scene.gaussians.means, ROW),
         entry("segment_scene", "groups.labels", made["segment_scene"].groups.labels, (VIEW, Y, X)),
         entry("correct", "features.covars", features.covars, (run.feature, *DIAGONAL), 4)[:-2] + " (diagonal) |",
@@ -264,7 +264,7 @@ def values_table(run: Run) -> str:
 
 def first_steps(run: Run) -> list[str]:
     """Write the steps before anything is built: the scene is read and prepared, and the run is planned."""
-    prepared, plan, made = run.prepared, run.made["make_plan"], run.made["align"]
+    prepared, plan, made = run.prepared, run.made["make_plan"], run.made["find_pixels"]
     pixels, limits, recovery = WIDTH * HEIGHT, plan.limits, made.recovery
     first = int(limits.per_view * plan.superpixels.start_share)
     scene = prepared.input_scene
@@ -272,7 +272,7 @@ def first_steps(run: Run) -> list[str]:
     return [
         step(
             "Read",
-            "`align` assumes an order of the rows, and measures how far the Gaussians then lie from their pixels. For",
+            "`find_pixels` assumes an order of the rows, and measures how far Gaussians lie from their pixels. For",
             say(
                 f'"{recovery.layout.description}" the median distance is {recovery.alignment.middle_px:.2f} pixels,',
                 recovery.layout.ids is None and recovery.frame is IDENTITY,

@@ -70,13 +70,13 @@ def read_before_after(
     """
     from gsmerge.io import read_gaussians
     from gsmerge.prepare.place_cameras import NO_VIEWS, PLACED_VIEWS, add_views
-    from gsmerge.reading.read_scene import load_files
+    from gsmerge.reading.read_scene import read_files
     from gsmerge.reading.scene_files import result_cameras
     from gsmerge.runtime.record import record_run
 
     if files.cameras is None and "cameras" not in files.named:  # a result may have cameras although its scene has none
         files = replace(files, cameras=next(filter(None, map(result_cameras, after)), None))
-    load = loaded if loaded is not None and loaded.files == files else load_files(files, **reading._asdict())
+    load = loaded if loaded is not None and loaded.files == files else read_files(files, **reading._asdict())
     if targets is not None or views is not None:
         require_views(load)
     scene, held_out, target_notes = held_out_views(load, targets, target_images, views)

@@ -18,7 +18,7 @@ from gsmerge.io.image_names import IMAGE_SUFFIXES, OTHER_SUFFIXES
 from gsmerge.jobs.states.state_file import holds_features, load_state
 from gsmerge.networks.checkpoint import load_checkpoint
 from gsmerge.reading.exporters import NO_HINTS
-from gsmerge.reading.read_scene import load_files
+from gsmerge.reading.read_scene import read_files
 from gsmerge.reading.scene_files import find_scene_files
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.settings.reading import OpacityChoice, ReadHints
@@ -63,7 +63,7 @@ def check_content(path: Path, *, opacity: OpacityChoice = "auto", hints: ReadHin
         if not holds_scene(path):
             file_check = _read_other(path)
         else:
-            load = load_files(find_scene_files(path), opacity=opacity, hints=hints)
+            load = read_files(find_scene_files(path), opacity=opacity, hints=hints)
             info, images = load.info, load.scene.images
             notes, num_photos = (*load.notes, *degree_notes(info)), 0 if images is None else len(images)
             file_check = FileCheck(

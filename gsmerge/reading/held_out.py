@@ -16,7 +16,7 @@ from gsmerge.io.photo_files import as_floats, photo_size
 from gsmerge.kernels.elementary import arccos
 from gsmerge.reading.exporters import NO_HINTS
 from gsmerge.reading.larger_photos import limit_photo_size
-from gsmerge.reading.photos.scene_photos import stored_photos
+from gsmerge.reading.photos.scene_photos import read_stored_photos
 from gsmerge.reading.read_scene import Loaded
 from gsmerge.reading.scene_files import SceneFiles
 from gsmerge.types import Scene, StrPath, Views
@@ -58,7 +58,7 @@ def read_held_out(load: Loaded, cameras: StrPath, images: StrPath | None = None)
     # the camera file may have photos inside; otherwise photos that are not named are searched
     inside = path if len(held_out.images) else None
     files = SceneFiles(load.files.ply, path, inside if images is None else Path(images), photo_option=_OPTION)
-    photos = stored_photos(files, held_out)
+    photos = read_stored_photos(files, held_out)
     if not len(photos):
         root = path if path.is_dir() else path.parent
         missing = next((name for name in held_out.names if find_image(root, name, path) is None), held_out.names[0])

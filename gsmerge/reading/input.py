@@ -15,7 +15,7 @@ from gsmerge.io.formats.ply import is_from_gsmerge
 from gsmerge.io.formats.rows import RESULT_COMMENT
 from gsmerge.reading.content_hash import list_changed, read_stats
 from gsmerge.reading.exporters import NO_HINTS, ReadHints
-from gsmerge.reading.read_scene import Loaded, load_files, load_scene
+from gsmerge.reading.read_scene import Loaded, load_scene, read_files
 from gsmerge.reading.scene_files import SceneFiles, result_cameras
 from gsmerge.runtime.documents import file_sha256
 from gsmerge.runtime.memory import release_memory
@@ -47,7 +47,7 @@ def read_input(
     its files changes while it is read.
     """
     stats = read_stats(files)
-    loaded = load_files(files, opacity=opacity, hints=hints)
+    loaded = read_files(files, opacity=opacity, hints=hints)
     # The scene already has the photos that were inside the camera file, so the copy in ``loaded`` is freed
     cameras = None if loaded.cameras is None else replace(loaded.cameras, images=())
     plys = (ply for scene_files in (files, *files.more) for ply in scene_files.plys)

@@ -59,10 +59,10 @@ class PhotoSource:
     transform: PhotoTransform | None  # from undistorted photos to the pixels of the rows; None: they are not changed
 
 
-def find_larger_and_masks(
+def read_larger_and_masks(
     files: SceneFiles, source: PhotoSource, cameras: Cameras, *, is_plain: bool = False
 ) -> tuple[LargePhotos | None, Masks, list[str]]:
-    """Find the photos at the size of their files, if this size is larger than the scene's, and the masks of photos.
+    """Read the photos at the size of their files, if this size is larger than the scene's, and the masks of photos.
 
     A larger photo is read from its file when it is used. Photos inside other files stay in memory. Masks come from
     files and, unless ``is_plain``, from the photos' transparency.

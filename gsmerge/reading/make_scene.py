@@ -16,9 +16,9 @@ from gsmerge.io.cameras.dataparser import read_dataparser
 from gsmerge.io.formats.read_gaussians import GaussianFile, file_notes
 from gsmerge.io.formats.rows import MAX_STRAY, RESULT_COMMENT
 from gsmerge.io.photo_files import NO_IMAGES, as_floats, photo_size
-from gsmerge.reading.alignment import AlignmentResult, align, check_pixels
+from gsmerge.reading.alignment import AlignmentResult, check_pixels, find_pixels
 from gsmerge.reading.exporters import ReadHints, choose_exporters, find_cameras_of_model, find_exporter
-from gsmerge.reading.larger_photos import PhotoSource, find_larger_and_masks, limit_photo_size, limit_view_size
+from gsmerge.reading.larger_photos import PhotoSource, limit_photo_size, limit_view_size, read_larger_and_masks
 from gsmerge.reading.loaded import Loaded
 from gsmerge.reading.photos.masks import CameraMaskError, check_masks
 from gsmerge.reading.photos.scene_photos import ScenePhotos, without_photo
@@ -47,7 +47,7 @@ def make_scene(
         result = AlignmentResult(None, cameras, as_floats(limited), pinholes, problem=problem)
     else:
         frames = partial(read_dataparser, files.ply, files.cameras)
-        result = align(ply, pinholes, limited, order=order, scale=hints.scene_scale, frames=frames)
+        result = find_pixels(ply, pinholes, limited, order=order, scale=hints.scene_scale, frames=frames)
     photos = photos.without_files(photos.damaged)  # now that all photos were decoded
     notes += [*size_notes, *result.notes]
     if result.pixel_ids is None:
@@ -149,7 +149,7 @@ def add_larger_and_masks(load: Loaded) -> Loaded:
         notes.append(Doubt(text) if files.named.intersection(mask_options) else text)
     is_plain = "masks" in files.named and files.masks is None  # the user wants no masks
     try:
-        large, masks, mask_notes = find_larger_and_masks(files, source, scene.cameras, is_plain=is_plain)
+        large, masks, mask_notes = read_larger_and_masks(files, source, scene.cameras, is_plain=is_plain)
     except SceneError as error:
         is_protecting = files.protect is not None and Path(error.path).is_relative_to(files.protect)
         is_listed = isinstance(error, CameraMaskError) or Path(error.path) in source.photos.paths
@@ -158,7 +158,7 @@ def add_larger_and_masks(load: Loaded) -> Loaded:
         remedy = error.remedy or f"pass --masks FOLDER, or --masks {NONE}"
         notes.append(Doubt(f"masks are left out: {error.path}: {error.problem}; {remedy}"))
         without_masks = replace(files, masks=None, named=files.named | {"masks"})
-        large, masks, mask_notes = find_larger_and_masks(without_masks, source, scene.cameras)
+        large, masks, mask_notes = read_larger_and_masks(without_masks, source, scene.cameras)
     masks, check_notes = check_masks(masks, files, scene)
     counts = masks.counts
     if scene.masks is not None:  # some views have no photo, and none of their pixels count

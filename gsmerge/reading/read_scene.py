@@ -42,7 +42,7 @@ from gsmerge.reading.photos.scene_photos import (
     keep_one_shape,
     name_by_photos,
     read_photos,
-    stored_photos,
+    read_stored_photos,
 )
 from gsmerge.reading.scene_files import SceneFiles, find_scene_files, result_cameras
 from gsmerge.reading.take_gaussians import confirm_colors
@@ -134,10 +134,10 @@ def load_scene(
     read_hints = make_hints(hints)
     named = {"cameras": cameras, "images": images, "masks": masks, "protect": protect}
     first, *others = (find_scene_files(scene_path, **named) for scene_path in (path, *more))
-    return load_files(replace(first, more=tuple(others)), opacity=opacity, hints=read_hints)
+    return read_files(replace(first, more=tuple(others)), opacity=opacity, hints=read_hints)
 
 
-def load_files(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: ReadHints = NO_HINTS) -> Loaded:
+def read_files(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: ReadHints = NO_HINTS) -> Loaded:
     """Read a scene as :func:`load_scene` does, from the files that :func:`find_scene_files` found."""
     with use_threads():
         loads = [
@@ -374,7 +374,7 @@ def move_cameras_to_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHi
     with suppress(SceneError):
         camera_file = read_scene_cameras(ply, files)
         if camera_file is not None:
-            pictures = stored_photos(files, camera_file) if photos else ()
+            pictures = read_stored_photos(files, camera_file) if photos else ()
             cameras = to_cameras(camera_file, photo_size(pictures))
             if "cameras" in files.named or check_cameras(ply.gaussians, ply.valid, cameras, NO_IMAGES).ok:
                 doubt = Doubt("the cameras do not fit the Gaussians; they stay as stored in their file")

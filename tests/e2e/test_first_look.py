@@ -31,9 +31,9 @@ def pages_in(folder: Path) -> list[Path]:
 def test_scene_without_a_command_is_compacted_and_shown(
     smallest_copy: Path, run: Run, opened: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert files.load_files  # which reads the scene, once
+    assert files.read_files  # which reads the scene, once
     monkeypatch.setattr(
-        "gsmerge.reading.read_scene.load_files", lambda *_, **__: pytest.fail("the page reads it again")
+        "gsmerge.reading.read_scene.read_files", lambda *_, **__: pytest.fail("the page reads it again")
     )
     said = run(smallest_copy / "scene.ply", *FAST, code=0)
     (page,) = pages_in(smallest_copy)

@@ -79,14 +79,14 @@ def test_moved_or_replaced_scene_is_not_read_again(
 
 
 def test_a_file_that_changes_while_it_is_read_is_refused(smallest_copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    read = stage.load_files
+    read = stage.read_files
 
     def read_and_replace(*arguments: Any, **options: Any) -> Any:
         loaded = read(*arguments, **options)
         replace(smallest_copy)
         return loaded
 
-    monkeypatch.setattr(stage, "load_files", read_and_replace)
+    monkeypatch.setattr(stage, "read_files", read_and_replace)
     out = smallest_copy.parent / "o.ply"
     with pytest.raises(SceneError, match=r"scene\.ply: changed while it was read; run this again"):
         compact_files(find_scene_files(smallest_copy), PLAIN, Outputs(out))

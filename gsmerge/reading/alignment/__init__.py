@@ -12,7 +12,7 @@ the photos, and ``upright`` solves for cameras if no file stores the frame of th
 
 # ruff: noqa: F401  names for other packages
 
-from gsmerge.reading.alignment.align_rows import AlignmentResult, Recovery, align
+from gsmerge.reading.alignment.align_rows import AlignmentResult, Recovery, find_pixels
 from gsmerge.reading.alignment.conventions import move_cameras, other_conventions
 from gsmerge.reading.alignment.dropped_rows import estimate_cameras
 from gsmerge.reading.alignment.explain import explain_misalignment, misalignment_error

@@ -52,7 +52,7 @@ _MOST_PLACES = 1 << 27  # largest number of rows times views for which rows are 
 
 @dataclass(frozen=True, eq=False)
 class RowSource:
-    """The Gaussians, the cameras and the photos of a scene, and hints about the rows; see :func:`align`."""
+    """The Gaussians, the cameras and the photos of a scene, and hints about the rows; see :func:`find_pixels`."""
 
     ply: GaussianFile
     camera_file: CameraFile
@@ -100,7 +100,7 @@ class Recovery:
 
 @dataclass(frozen=True, eq=False)
 class AlignmentResult:
-    """Result of :func:`align`: the pixel of every row if rows have pixels, and the cameras that see the Gaussians."""
+    """Result of :func:`find_pixels`: the pixel of every row if rows have pixels, and the cameras that see the rows."""
 
     # ``[n]`` int64, the pixel ``(view·H + y)·W + x`` of each row, -1 for a row without a pixel; None if no row has a
     # pixel
@@ -120,7 +120,7 @@ class AlignmentResult:
     own_views: int = 0
 
 
-def align(
+def find_pixels(
     ply: GaussianFile,
     camera_file: CameraFile,
     photos: PhotoArrays = (),

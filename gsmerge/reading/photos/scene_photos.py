@@ -280,7 +280,7 @@ def _check_header(path: Path) -> str | None:
     return f"{size.problem}; {CONVERT}" if size.remedy == CONVERT else size.problem
 
 
-def stored_photos(files: SceneFiles, camera_file: CameraFile) -> PhotoArrays:
+def read_stored_photos(files: SceneFiles, camera_file: CameraFile) -> PhotoArrays:
     """Read the photos of all cameras, from files of their names or from one file that has all photos.
 
     Returns no photos if none exist. SceneError if a photo is missing or cannot be read, or if two photos differ in

@@ -14,7 +14,7 @@ from gsmerge.io.formats.ply import file_bytes
 from gsmerge.io.jsonl import each_line
 from gsmerge.prepare.prepare_scene import LEAST_VIEWS
 from gsmerge.reading.held_out import HeldOutViews, read_held_out
-from gsmerge.reading.read_scene import load_files
+from gsmerge.reading.read_scene import read_files
 from gsmerge.reading.scene_files import find_scene_files
 from gsmerge.road import compact
 from gsmerge.scoring.evaluate import INPUT, EvaluateOptions, evaluate
@@ -126,7 +126,7 @@ def load_source(source: ChartScene) -> tuple[Scene, HeldOutViews | None, tuple[s
 
     The held-out views are read from ``source.targets``. Without targets, some views are taken out of the scene.
     """
-    load = load_files(find_scene_files(source.path))
+    load = read_files(find_scene_files(source.path))
     if source.targets is not None:
         return load.scene, read_held_out(load, source.targets), load.notes
     return *hold_out(load.scene), load.notes

@@ -34,14 +34,14 @@ def stress(
     json: opt.Json = False, progress: opt.Progress = None, quiet: opt.Quiet = False,
 ) -> None:  # fmt: skip
     """Compact a scene under bad conditions, and report for each condition if the required property holds."""
-    from gsmerge.reading.read_scene import load_files
+    from gsmerge.reading.read_scene import read_files
     from gsmerge.reading.scene_files import find_scene_files
     from gsmerge.research.stress import stress as stress_scene
     from gsmerge.runtime.documents import document_head, note_entries
 
     settings, places = opt.read_settings(SETTINGS, set).make(*SETTINGS)
     cameras, images = opt.path_or_none(places.cameras), opt.path_or_none(places.images)
-    load = load_files(find_scene_files(scene, cameras=cameras, images=images))
+    load = read_files(find_scene_files(scene, cameras=cameras, images=images))
     require_views(load)
     targets, target_images = map(opt.read_path, (places.targets, places.target_images))
     _, held_out, adapted = held_out_views(load, targets, target_images, None)
