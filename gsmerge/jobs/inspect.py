@@ -28,8 +28,8 @@ from gsmerge.prepare.support import count_views_in_world
 from gsmerge.prepare.true_pixels import raise_sizes, with_pixels
 from gsmerge.raster.photos import LEAST_OPACITY
 from gsmerge.reading.alignment import check_cameras
+from gsmerge.reading.candidates import read_scene_cameras
 from gsmerge.reading.exporters import ReadHints, make_hints
-from gsmerge.reading.larger_photos import read_scene_cameras
 from gsmerge.reading.read_scene import Loaded, align_scene, read_gaussian_file
 from gsmerge.reading.scene_files import SceneFiles, find_scene_files
 from gsmerge.runtime.arguments import check_arguments

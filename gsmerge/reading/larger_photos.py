@@ -1,13 +1,11 @@
-"""Read the cameras of a scene, limit the size of its photos, and find its larger photos and its masks."""
+"""Limit the size of a scene's photos, and read its larger photos and its masks."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from gsmerge.frozen import dataclass, replace
-from gsmerge.io.cameras.camera_file import CameraFile, drop_repeats, missing_intrinsics, to_cameras, undistort_photos
-from gsmerge.io.cameras.read_cameras import read_cameras, read_sharp_camera
-from gsmerge.io.formats.read_gaussians import GaussianFile
+from gsmerge.io.cameras.camera_file import CameraFile, to_cameras, undistort_photos
 from gsmerge.io.photo_files import (
     PhotoArrays,
     PhotoTransform,
@@ -19,7 +17,6 @@ from gsmerge.io.photo_files import (
     resize_to,
 )
 from gsmerge.kernels.matrices import matmul
-from gsmerge.reading.alignment import estimate_cameras
 from gsmerge.reading.photos.masks import NO_MASKS, Masks, read_masks
 from gsmerge.reading.photos.scene_photos import ScenePhotos
 from gsmerge.reading.scene_files import SceneFiles
@@ -27,26 +24,6 @@ from gsmerge.types import Cameras, LargePhotos
 
 _MAX_BYTES = 2 << 30  # photos of at most this size, as floats, are resized only if rows have no pixels
 _EDGE_ROUNDING = 1e-6  # pixels by which the edge of a window may be off
-
-
-def read_scene_cameras(ply: GaussianFile, files: SceneFiles) -> CameraFile | None:
-    """Read a scene's cameras from their file or the ``.ply``, or estimate them from the rows; None if that fails.
-
-    Repeated views are dropped, unless the number of rows is a multiple of the number of views. Raises SceneError if a
-    file has poses, but no focal length.
-    """
-    if files.cameras is not None:
-        stored = read_cameras(files.cameras, folder=files.ply.parent)
-        if not stored.has_intrinsics:
-            raise missing_intrinsics(stored.path)
-        # each repeated view may have rows, too, if the number of rows is a multiple of the number of views
-        return drop_repeats(stored) if len(ply.gaussians) % len(stored) else stored
-    if files.is_state:  # cameras of a state are in its own file, or there are none
-        return None
-    sharp = None if "cameras" in files.named else read_sharp_camera(files.ply)
-    if sharp is not None:
-        return sharp
-    return estimate_cameras(files.ply, ply.gaussians.means, ply.valid)
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,8 +17,8 @@ from gsmerge.io.formats.rows import RESULT_COMMENT
 from gsmerge.io.image_names import IMAGE_PLACES, IMAGE_SUFFIXES, describe_unread
 from gsmerge.io.photo_files import NO_IMAGES, as_floats, photo_size
 from gsmerge.reading.alignment import AlignmentResult, check_cameras, check_pixels
+from gsmerge.reading.candidates import read_scene_cameras
 from gsmerge.reading.exporters import NO_HINTS, ReadHints, find_exporter, make_hints
-from gsmerge.reading.larger_photos import read_scene_cameras
 from gsmerge.reading.loaded import Loaded
 from gsmerge.reading.make_scene import (
     add_larger_and_masks,

@@ -106,13 +106,18 @@ class SceneFiles:
         return (*self.plys, *(path for path in beside if path is not None))
 
     @property
+    def is_spread(self) -> bool:
+        """Return whether cameras lie in several folders below the scene, which may be several scenes."""
+        return self.below and len({Path(os.path.relpath(path, self.root)).parts[0] for path in self.others}) > 1
+
+    @property
     def choices(self) -> list[SceneFiles]:
         """Return a copy of this object for each camera file to try, in the order in which they are tried.
 
         Cameras in sub-folders are tried only if one sub-folder has them all, since several sub-folders may be several
         scenes.
         """
-        if self.below and len({Path(os.path.relpath(path, self.root)).parts[0] for path in self.others}) > 1:
+        if self.is_spread:
             return [self]
         # Images inside the file of ``cameras`` belong only to the cameras of that file
         images = None if self.images == self.cameras else self.images

@@ -1,0 +1,165 @@
+"""Choose the cameras and photos of a scene by evidence, and say why.
+
+The functions read no files. They see only what :mod:`gsmerge.reading.examine` found out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from gsmerge.errors import Doubt, SceneError, list_doubts, split_notes
+from gsmerge.frozen import dataclass, replace
+from gsmerge.io.cameras.camera_file import CameraFile
+from gsmerge.io.image_names import IMAGE_SUFFIXES
+from gsmerge.reading.candidates import Candidate, Views
+from gsmerge.reading.loaded import Loaded
+from gsmerge.reading.photos.scene_photos import describe_missing
+from gsmerge.reading.scene_files import SceneFiles
+from gsmerge.settings.reading import NONE
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What shows whether a candidate, which is cameras with or without photos, belongs to the Gaussians."""
+
+    candidate: Candidate
+    error: SceneError | None = None  # why it does not belong to the Gaussians, or cannot be read; None if it may belong
+    stored: CameraFile | None = None  # its cameras as stored, without images; None if they cannot be read
+    are_pixels: bool = False  # True: the rows are the pixels of its views
+    share_near: float | None = None  # of the Gaussians, near their pixels; None unless rows are its pixels
+    num_views: int = 0
+    names: tuple[str, ...] = ()  # of its views
+    own_views: int = 0  # number of views that the rows form, if they are not the pixels of its views; else 0
+    photo_place: Path | None = None  # folder or file of its photos; None without any
+    has_photos: bool = False
+    num_shown: int = 0  # number of its views that a photo shows
+    photos_explain: bool = False  # True: the photos that names propose explain what most views show
+    photo_error: SceneError | None = None  # why its photos are left out
+    notes: tuple[str, ...] = ()  # of the scene with the candidate
+    load: Loaded | None = None  # the scene with the candidate; None if it cannot be chosen
+
+    @property
+    def files(self) -> SceneFiles:
+        """The scene's files with these cameras."""
+        return self.candidate.files
+
+
+def is_needed(candidate: Candidate, tried: Sequence[Evidence]) -> bool:
+    """Return whether a candidate has to be examined, after those that were ``tried``.
+
+    Camera files are examined until one certainly fits. Cameras of the rows are estimated if no file fits, or if rows
+    form more views than the chosen file has cameras. Cameras that the caller named are not replaced if they do not fit,
+    and neither are cameras beside photos that the caller named and that are to blame.
+    """
+    if not candidate.replaces_files:
+        return not any(map(certainly_fits, tried))
+    files, best = tried[0].files, choose(tried)
+    if best is not None:
+        return best.own_views > best.num_views
+    blames_photos = "images" in files.named and Path(find_cause(tried).path).is_relative_to(files.images or files.ply)
+    return "cameras" not in files.named and not blames_photos
+
+
+def certainly_fits(evidence: Evidence) -> bool:
+    """Return whether a candidate certainly belongs to the Gaussians, so that no other has to be examined.
+
+    - With photos, it does if rows are its pixels, if the photos show its views, or if there are no other cameras.
+    - Without photos, it does if no other cameras lie in folders below the scene, and if rows are its pixels or the
+      scene has no doubts.
+    """
+    files = evidence.files
+    if evidence.error is not None:
+        return False
+    if evidence.has_photos:
+        return evidence.are_pixels or evidence.photos_explain or not files.others
+    return not files.below and (evidence.are_pixels or not list_doubts(evidence.notes))
+
+
+def choose(tried: Sequence[Evidence]) -> Evidence | None:
+    """Choose the first cameras that certainly fit, or else the first that may fit; None if none does.
+
+    Cameras of the rows, if they were needed, are chosen if no camera file fits, or if the file lacks a camera of some
+    view; a note says so. They are not chosen if photos that the caller named cannot be used with them.
+    """
+    files = tried[0].files
+    fitting = [one for one in tried if one.error is None and not one.candidate.replaces_files]
+    best = next(filter(certainly_fits, fitting), fitting[0] if fitting else None)
+    rows = tried[-1]
+    lacks_photos = not rows.has_photos and "images" in files.named and files.images is not None
+    if not rows.candidate.replaces_files or rows.error is not None or lacks_photos:
+        return best
+    missing = describe_missing(rows.names, tried[0].stored, is_right=best is not None)
+    if missing is not None:
+        return replace(rows, notes=(missing, *split_notes(rows.notes, "estimated cameras")[1]))
+    return best or leave_out(rows, files, [str(files.cameras)], find_cause(tried))
+
+
+def release_spare(evidence: Evidence, earlier: Sequence[Evidence]) -> Evidence:
+    """Return evidence without its scene, whose arrays take memory, if an earlier camera file is chosen before it."""
+    may_be_chosen = evidence.candidate.replaces_files or certainly_fits(evidence)
+    is_spare = not may_be_chosen and any(one.error is None for one in earlier)
+    return replace(evidence, load=None) if is_spare else evidence
+
+
+def find_cause(tried: Sequence[Evidence]) -> SceneError:
+    """Return why the first of the candidates that do not fit does not fit."""
+    return next(one.error for one in tried if one.error is not None)
+
+
+def explain_refusal(tried: Sequence[Evidence]) -> SceneError:
+    """Return why no candidate is chosen, with what the user can do."""
+    cause, files = find_cause(tried), tried[0].files
+    options = [f"--{name} {NONE}" for name in ("cameras", "images") if name in files.named and getattr(files, name)]
+    read_alone = f"{' and '.join(options)} reads the Gaussians alone" if options else ""
+    return SceneError(cause.path, cause.problem, "; ".join(filter(None, (cause.remedy, read_alone))))
+
+
+def choose_photos(shown: Evidence, bare: Evidence, views: Views) -> Evidence:
+    """Choose cameras with their photos (``shown``) or without photos (``bare``), with a doubt that says why.
+
+    Photos that do not fit are left out if it is certain that the cameras belong to the scene: if rows are pixels of the
+    cameras, if the photos cannot be read, or if they were found by the cameras' names. Cameras that merely see the
+    Gaussians may still belong to another scene.
+    """
+    cause, folder = shown.error, views.place
+    if cause is None or bare.error is not None:
+        return shown
+    is_photo = Path(cause.path).suffix.lower() in IMAGE_SUFFIXES or cause.path == str(folder) or not views.photos.named
+    if not (bare.are_pixels or is_photo or views.photos.by_names):
+        return shown
+    left_out = leave_out(bare, replace(views.files, images=folder), [f"the photos in {folder}"], cause)
+    return replace(left_out, photo_error=cause)
+
+
+def needs_bare(shown: Evidence, views: Views) -> bool:
+    """Return whether cameras have to be examined without their photos, since these do not fit and may be left out.
+
+    Photos that the caller named are never left out, and photos of a lens are needed to undistort what it shows.
+    """
+    has_lenses = views.camera_file is not None and bool(views.camera_file.lenses)
+    return shown.error is not None and "images" not in views.files.named and not has_lenses
+
+
+def blames_photos(shown: Evidence, views: Views) -> bool:
+    """Return whether photos that the caller named are to blame for an error that is about cameras that were found."""
+    is_found = "images" in views.files.named and "cameras" not in views.files.named
+    is_about_cameras = shown.error is not None and shown.stored is not None and shown.error.path == shown.stored.path
+    return is_found and is_about_cameras
+
+
+def leave_out(evidence: Evidence, files: SceneFiles, left_out: Sequence[str], cause: SceneError) -> Evidence:
+    """Return a candidate with a doubt which says what is left out, why, and what the user can do.
+
+    ``left_out`` describes the files that are left out. If photos cannot be used without these files, the doubt also
+    names the photos, and replaces the notes on photos.
+    """
+    photo_notes, notes = split_notes(evidence.notes, "unused photos")
+    names = [*left_out, *([f"the photos in {files.images or files.ply.parent}"] if photo_notes else [])]
+    known_paths = map(str, (files.ply, files.ply.parent, files.cameras, files.images))
+    damaged_file = "" if cause.path in known_paths else f"{cause.path}: "
+    option, value = ("cameras", "FILE") if names[0] == str(files.cameras) else ("images", "FOLDER")
+    remedy = cause.remedy or f"pass --{option} {value}, or --{option} {NONE}"
+    verb = "is" if names == [str(files.cameras)] else "are"
+    doubt = f"{' and '.join(names)} {verb} left out: {damaged_file}{cause.problem}; {remedy}"
+    return replace(evidence, notes=(Doubt(" ".join(doubt.split())), *notes))

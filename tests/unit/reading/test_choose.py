@@ -1,0 +1,226 @@
+"""Cameras and photos are chosen by evidence, which is made up here."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from messages import noted
+
+from gsmerge.errors import Doubt, Note, SceneError
+from gsmerge.io.cameras.camera_file import CameraFile
+from gsmerge.reading.candidates import Candidate, Views, list_candidates
+from gsmerge.reading.choose import (
+    Evidence,
+    blames_photos,
+    certainly_fits,
+    choose,
+    choose_photos,
+    explain_refusal,
+    find_cause,
+    is_needed,
+    needs_bare,
+    release_spare,
+)
+from gsmerge.reading.photos.scene_photos import ScenePhotos
+from gsmerge.reading.scene_files import SceneFiles
+
+FOLDER = Path("scene")
+FIRST, SECOND, IMAGES = FOLDER / "transforms.json", FOLDER / "sparse/0", FOLDER / "images"
+FILES = SceneFiles(FOLDER / "a.ply", FIRST, IMAGES, root=FOLDER, others=(SECOND,))
+CAMERAS = list_candidates(FILES)  # the first file, the second file, and cameras of the rows
+ROWS = CAMERAS[-1]
+DAMAGED = SceneError(FIRST, "expected cameras, found none", "export them again")
+OTHER_PHOTOS = SceneError(IMAGES, "other photos")
+
+
+def stored(*names: str) -> CameraFile:
+    """Return cameras of these names, all in one place."""
+    count = len(names)
+    poses, K, sides = np.tile(np.eye(4), (count, 1, 1)), np.tile(np.eye(3), (count, 1, 1)), np.ones(count, int)
+    return CameraFile(str(FIRST), poses, K, sides, sides, names, "transforms.json")
+
+
+def fits(candidate: Candidate = CAMERAS[0], **facts: Any) -> Evidence:
+    """Return evidence on cameras of three views that can be read."""
+    usual = {"names": ("0.png", "1.png", "2.png"), "num_views": 3, "stored": stored("0.png", "1.png", "2.png")}
+    return Evidence(candidate, **(usual | facts))
+
+
+def fails(candidate: Candidate = CAMERAS[0], error: SceneError = DAMAGED, **facts: Any) -> Evidence:
+    return Evidence(candidate, error, **facts)
+
+
+def with_files(evidence: Evidence, **changes: Any) -> Evidence:
+    """Return evidence on a candidate of a scene with other files."""
+    candidate = replace(evidence.candidate, files=replace(evidence.files, **changes))
+    return replace(evidence, candidate=candidate)
+
+
+def test_files_are_tried_in_order_and_the_rows_last() -> None:
+    assert [one.files.cameras for one in CAMERAS] == [FIRST, SECOND, None]
+    assert [one.replaces_files for one in CAMERAS] == [False, False, True]
+    assert len(list_candidates(FILES, keeps_cameras=True)) == 2
+    assert len(list_candidates(replace(FILES, cameras=None, others=()))) == 1  # its cameras are those of the rows
+    below = replace(FILES, cameras=None, below=True, others=(FOLDER / "a/sparse", FOLDER / "b/sparse"))
+    assert [one.files.cameras for one in list_candidates(below)] == [None]  # several folders may be several scenes
+
+
+@pytest.mark.parametrize(
+    ("facts", "files", "expected"),
+    [
+        ({"has_photos": True, "are_pixels": True}, {}, True),
+        ({"has_photos": True, "photos_explain": True}, {}, True),
+        ({"has_photos": True}, {}, False),
+        ({"has_photos": True}, {"others": ()}, True),
+        ({}, {}, True),
+        ({"notes": ("a note",)}, {}, True),
+        ({"notes": (Doubt("a doubt"),)}, {}, False),
+        ({"notes": (Doubt("a doubt"),), "are_pixels": True}, {}, True),
+        ({"are_pixels": True}, {"below": True}, False),
+        ({"are_pixels": True, "error": DAMAGED}, {}, False),
+    ],
+)
+def test_pixels_or_photos_make_cameras_certain(facts: dict[str, Any], files: dict[str, Any], expected: bool) -> None:
+    evidence = with_files(fits(**facts), **files)
+    assert certainly_fits(evidence) is expected
+    assert is_needed(CAMERAS[1], [evidence]) is not expected
+
+
+def test_the_first_certain_cameras_precede_the_first_that_fit() -> None:
+    unsure = fits(has_photos=True)
+    certain = fits(CAMERAS[1], has_photos=True, photos_explain=True)
+    assert choose([unsure, certain]) is certain
+    assert choose([unsure, fits(CAMERAS[1], has_photos=True)]) is unsure
+    chosen = choose([fails(), fits(CAMERAS[1], has_photos=True)])
+    assert chosen is not None
+    assert chosen.files.cameras == SECOND
+    assert choose([fails(), fails(CAMERAS[1])]) is None
+    assert find_cause([unsure, fails()]) is DAMAGED
+
+
+def test_only_scenes_that_may_be_chosen_are_kept() -> None:
+    load: Any = object()
+    unsure, certain = fits(has_photos=True, load=load), fits(has_photos=True, are_pixels=True, load=load)
+    assert release_spare(unsure, []).load is load
+    assert release_spare(unsure, [fails()]).load is load
+    assert release_spare(unsure, [unsure]).load is None
+    assert release_spare(certain, [unsure]).load is load
+    assert release_spare(replace(unsure, candidate=ROWS), [unsure]).load is load  # may replace the cameras of a file
+
+
+@pytest.mark.parametrize(
+    ("evidence", "files", "expected"),
+    [
+        (fits(), {}, False),
+        (fits(own_views=3), {}, False),
+        (fits(own_views=4), {}, True),
+        (fits(own_views=4), {"named": frozenset({"cameras"})}, True),
+        (fails(), {}, True),
+        (fails(), {"named": frozenset({"cameras"})}, False),
+        (fails(), {"named": frozenset({"images"})}, True),
+        (fails(error=OTHER_PHOTOS), {"named": frozenset({"images"})}, False),
+        (fails(error=OTHER_PHOTOS), {}, True),
+    ],
+)
+def test_rows_give_cameras_where_files_do_not(evidence: Evidence, files: dict[str, Any], expected: bool) -> None:
+    assert is_needed(ROWS, [with_files(evidence, **files)]) is expected
+
+
+@pytest.mark.parametrize("cameras", [None, FILES.ply])
+def test_cameras_of_the_rows_and_in_the_file_have_no_substitute(cameras: Path | None) -> None:
+    assert not any(one.replaces_files for one in list_candidates(replace(FILES, cameras=cameras)))
+
+
+def test_cameras_that_do_not_fit_are_left_out_for_those_of_the_rows() -> None:
+    rows = fits(ROWS, notes=(Note("no photo is used", "unused photos"), "a note"))
+    chosen = choose([fails(), rows])
+    assert chosen is not None
+    assert chosen.files.cameras is None
+    assert isinstance(chosen.notes[0], Doubt)
+    assert noted(chosen.notes[:1], str(FIRST), str(IMAGES), "are left out", DAMAGED.problem, DAMAGED.remedy)
+    assert chosen.notes[1:] == ("a note",)
+    assert choose([fails(), replace(rows, error=DAMAGED)]) is None
+
+
+def test_rows_of_more_views_than_cameras_name_the_views_that_lack_one() -> None:
+    few = fits(num_views=2, names=("0.png", "1.png"), stored=stored("0.png", "1.png"), own_views=3)
+    rows = fits(ROWS, notes=(Note("estimated", "estimated cameras"),))
+    chosen = choose([few, rows])
+    assert chosen is not None
+    assert noted(chosen.notes, "1 of 3 views has no camera", str(FIRST), "2.png")
+    assert len(chosen.notes) == 1
+    unknown = replace(few, stored=None)
+    assert choose([unknown, rows]) is unknown
+
+
+def test_photos_that_the_caller_named_are_not_given_up() -> None:
+    named = frozenset({"images"})
+    best = with_files(fits(num_views=2, own_views=3, has_photos=True, stored=stored("0.png", "1.png")), named=named)
+    rows = with_files(fits(ROWS), named=named)
+    assert choose([best, rows]) is best
+    chosen = choose([best, replace(rows, has_photos=True)])
+    assert chosen is not None
+    assert chosen.files.cameras is None
+
+
+@pytest.mark.parametrize(
+    ("cause", "bare", "photos", "expected"),
+    [
+        (SceneError(FOLDER / "a.ply", "no views"), {}, {}, False),
+        (SceneError(FOLDER / "a.ply", "no views"), {"are_pixels": True}, {}, True),
+        (SceneError(FOLDER / "a.ply", "no views"), {}, {"by_names": True}, True),
+        (OTHER_PHOTOS, {}, {}, True),
+        (SceneError(IMAGES / "0.png", "a damaged photo"), {}, {}, True),
+        (SceneError(IMAGES / "0.png", "a damaged photo"), {"error": DAMAGED}, {}, False),
+    ],
+)
+def test_photos_are_left_out_only_beside_cameras_that_belong_to_the_scene(
+    cause: SceneError, bare: dict[str, Any], photos: dict[str, Any], expected: bool
+) -> None:
+    views = Views(CAMERAS[0], stored("0.png"), ScenePhotos(IMAGES, named=(IMAGES / "0.png",), **photos))
+    shown = fails(error=cause, photo_place=IMAGES)
+    chosen = choose_photos(shown, fits(photo_place=IMAGES, **bare), views)
+    assert (chosen is not shown) is expected
+    assert noted(chosen.notes, f"the photos in {IMAGES} are left out", cause.problem) is expected
+    assert (chosen.photo_error is cause) is expected
+
+
+@pytest.mark.parametrize(
+    ("error", "named", "lenses", "expected"),
+    [
+        (None, (), (), False),
+        (DAMAGED, (), (), True),
+        (DAMAGED, ("images",), (), False),
+        (DAMAGED, (), ("a lens",), False),
+    ],
+)
+def test_cameras_are_examined_alone_only_if_their_photos_may_be_left_out(
+    error: SceneError | None, named: tuple[str, ...], lenses: Any, expected: bool
+) -> None:
+    candidate = Candidate(replace(FILES, named=frozenset(named)))
+    views = Views(candidate, replace(stored("0.png"), lenses=lenses))
+    assert needs_bare(Evidence(candidate, error), views) is expected
+
+
+def test_named_photos_are_blamed_for_cameras_that_were_found() -> None:
+    def blames(error: SceneError, *named: str) -> bool:
+        candidate = Candidate(replace(FILES, named=frozenset(named)))
+        return blames_photos(fails(candidate, error, stored=stored("0.png")), Views(candidate, stored("0.png")))
+
+    assert blames(DAMAGED, "images")
+    assert not blames(DAMAGED)
+    assert not blames(OTHER_PHOTOS, "images")
+    assert not blames(DAMAGED, "images", "cameras")
+
+
+def test_a_refusal_says_what_reads_the_gaussians_alone() -> None:
+    named = with_files(fails(), named=frozenset({"cameras", "images"}))
+    error = explain_refusal([named])
+    assert (error.path, error.problem) == (DAMAGED.path, DAMAGED.problem)
+    assert DAMAGED.remedy in error.remedy
+    assert "--cameras none and --images none" in error.remedy
+    assert explain_refusal([fails()]).remedy == DAMAGED.remedy
