@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
-from gsmerge.errors import Doubt, SceneError
+from gsmerge.errors import Doubt, SceneError, attempt
 from gsmerge.geometry.frame import canonicalise
 from gsmerge.io import GaussianFile, file_notes, kept_comments
+from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.formats.gsm import list_batches
 from gsmerge.io.formats.ply import is_from_gsmerge
 from gsmerge.io.formats.read_gaussians import degree_notes
@@ -30,7 +30,7 @@ from gsmerge.raster.photos import LEAST_OPACITY
 from gsmerge.reading.alignment import check_cameras
 from gsmerge.reading.candidates import read_scene_cameras
 from gsmerge.reading.exporters import ReadHints, make_hints
-from gsmerge.reading.read_scene import Loaded, align_scene, read_gaussian_file
+from gsmerge.reading.read_scene import Loaded, find_views, finish, read_gaussian_file
 from gsmerge.reading.scene_files import SceneFiles, find_scene_files
 from gsmerge.runtime.arguments import check_arguments
 from gsmerge.runtime.documents import finite, note_entries, note_lines
@@ -140,13 +140,12 @@ def _describe_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> d
         "coverage": [],
         "new_views": None if expected is None else asdict(expected),
     }
-    try:
-        load = align_scene(ply, files, hints=hints)
-    except SceneError as error:
-        with suppress(SceneError):
-            camera_file = None if files.cameras is None else read_scene_cameras(ply, files)
-            facts |= {} if camera_file is None else {"num_views": len(camera_file), "camera_format": camera_file.source}
-        return facts | {"alignment_problem": str(error)}
+    load = attempt(finish, find_views(ply, files, hints))
+    if isinstance(load, SceneError):
+        camera_file = None if files.cameras is None else attempt(read_scene_cameras, ply, files)
+        if isinstance(camera_file, CameraFile):
+            facts |= {"num_views": len(camera_file), "camera_format": camera_file.source}
+        return facts | {"alignment_problem": str(load)}
     facts |= {name: (path := getattr(load.files, name)) and str(path) for name in ("cameras", "images")}
     facts |= _describe_scene(load, is_result=is_result)
     if load.recovery is None or load.alignment is None:

@@ -12,6 +12,7 @@ from gsmerge.errors import Doubt, SceneError, list_doubts, split_notes
 from gsmerge.frozen import dataclass, replace
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.image_names import IMAGE_SUFFIXES
+from gsmerge.reading.alignment import CameraCheck
 from gsmerge.reading.candidates import Candidate, Views
 from gsmerge.reading.loaded import Loaded
 from gsmerge.reading.photos.scene_photos import describe_missing
@@ -28,6 +29,7 @@ class Evidence:
     stored: CameraFile | None = None  # its cameras as stored, without images; None if they cannot be read
     are_pixels: bool = False  # True: the rows are the pixels of its views
     share_near: float | None = None  # of the Gaussians, near their pixels; None unless rows are its pixels
+    sight: CameraCheck | None = None  # what its cameras see; None if it was not measured
     num_views: int = 0
     names: tuple[str, ...] = ()  # of its views
     own_views: int = 0  # number of views that the rows form, if they are not the pixels of its views; else 0

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from gsmerge.errors import Doubt, Note, SceneError, count_words
+from gsmerge.errors import Doubt, Note, SceneError, attempt, count_words
+from gsmerge.frozen import dataclass, replace
 from gsmerge.geometry.transforms import move_views
 from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, to_cameras
 from gsmerge.io.cameras.dataparser import read_dataparser
@@ -29,10 +28,20 @@ from gsmerge.settings.reading import NONE
 from gsmerge.types import NO_CAMERAS, Scene
 
 
-def make_scene(
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """Cameras and photos beside the Gaussians of a file, before a scene is made of them."""
+
+    files: SceneFiles
+    result: AlignmentResult  # the cameras, the photos, and the pixels of the rows
+    notes: tuple[str, ...]
+    source: PhotoSource | None = None  # the photos as stored; None without views
+
+
+def place_views(
     ply: GaussianFile, files: SceneFiles, hints: ReadHints, camera_file: CameraFile, photos: ScenePhotos
-) -> Loaded:
-    """Combine Gaussians, cameras and photos. Raises SceneError if the cameras or the photos cannot be used."""
+) -> Placed:
+    """Place cameras and photos beside Gaussians. Raises SceneError if the cameras or the photos cannot be used."""
     # the order of the rows is that of the hints, of the named exporter, or of the format of the cameras
     order: str = hints.order
     if order == "auto":
@@ -56,11 +65,11 @@ def make_scene(
         result = replace(result, cameras=cameras, images=images)
         notes += size_notes
     source = PhotoSource(camera_file, photos, photo_size(limited), result.transform)
-    return make_loaded(ply, files, hints, result, notes, source)
+    return Placed(files, result, tuple(notes), source)
 
 
-def make_scene_without_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> Loaded:
-    """Make a scene without views; a run places views later. A note says that photos are not used."""
+def place_no_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> Placed:
+    """Return that a scene has no views; a run places views later. A note says that photos are not used."""
     advice = find_cameras_of_model(ply.info)
     notes = [advice] if advice else []
     check_hints(ply, hints)
@@ -72,22 +81,15 @@ def make_scene_without_views(ply: GaussianFile, files: SceneFiles, hints: ReadHi
         )
         notes += [Note(f"the photos in {files.images} are not used: {reason}", "unused photos")]
     problem = "expected one Gaussian per pixel, found no cameras"
-    return make_loaded(ply, files, hints, AlignmentResult(None, NO_CAMERAS, NO_IMAGES, None, problem=problem), notes)
+    return Placed(files, AlignmentResult(None, NO_CAMERAS, NO_IMAGES, None, problem=problem), tuple(notes))
 
 
-def make_loaded(
-    ply: GaussianFile,
-    files: SceneFiles,
-    hints: ReadHints,
-    result: AlignmentResult,
-    notes: Sequence[str],
-    source: PhotoSource | None = None,
-) -> Loaded:
+def make_scene(ply: GaussianFile, placed: Placed, hints: ReadHints) -> Loaded:
     """Make a scene of the visible Gaussians and all views, with all facts about how it was read.
 
-    ``result`` has the cameras, the photos, and the pixels of the rows. ``source`` has the photos as stored; the scene
-    has no larger photos and no masks yet, see :func:`add_larger_and_masks`.
+    The scene has no larger photos and no masks yet, see :func:`add_larger_and_masks`.
     """
+    files, result, source = placed.files, placed.result, placed.source
     absent = [] if source is None else source.photos.absent
     camera_file, recovery = result.camera_file, result.recovery
     gaussians, pixels = take_gaussians(ply, result)
@@ -117,7 +119,7 @@ def make_loaded(
         files=files,
         cameras=camera_file,
         exporters=choose_exporters(hints.exporter, ply.info, order, format_name),
-        notes=(*files.notes, *file_notes(ply.info), *doubts, *notes, *([faint] if num_faint else [])),
+        notes=(*files.notes, *file_notes(ply.info), *doubts, *placed.notes, *([faint] if num_faint else [])),
         alignment=alignment,
         recovery=recovery,
         problem=result.problem,
@@ -148,17 +150,17 @@ def add_larger_and_masks(load: Loaded) -> Loaded:
         text = f"the pictures of --{' and --'.join(mask_options)} are not used, since there are no photos"
         notes.append(Doubt(text) if files.named.intersection(mask_options) else text)
     is_plain = "masks" in files.named and files.masks is None  # the user wants no masks
-    try:
-        large, masks, mask_notes = read_larger_and_masks(files, source, scene.cameras, is_plain=is_plain)
-    except SceneError as error:
-        is_protecting = files.protect is not None and Path(error.path).is_relative_to(files.protect)
-        is_listed = isinstance(error, CameraMaskError) or Path(error.path) in source.photos.paths
+    read = attempt(read_larger_and_masks, files, source, scene.cameras, is_plain=is_plain)
+    if isinstance(read, SceneError):
+        is_protecting = files.protect is not None and Path(read.path).is_relative_to(files.protect)
+        is_listed = isinstance(read, CameraMaskError) or Path(read.path) in source.photos.paths
         if "masks" in files.named or is_protecting or is_listed:
-            raise
-        remedy = error.remedy or f"pass --masks FOLDER, or --masks {NONE}"
-        notes.append(Doubt(f"masks are left out: {error.path}: {error.problem}; {remedy}"))
+            raise read
+        remedy = read.remedy or f"pass --masks FOLDER, or --masks {NONE}"
+        notes.append(Doubt(f"masks are left out: {read.path}: {read.problem}; {remedy}"))
         without_masks = replace(files, masks=None, named=files.named | {"masks"})
-        large, masks, mask_notes = read_larger_and_masks(without_masks, source, scene.cameras)
+        read = read_larger_and_masks(without_masks, source, scene.cameras)
+    large, masks, mask_notes = read
     masks, check_notes = check_masks(masks, files, scene)
     counts = masks.counts
     if scene.masks is not None:  # some views have no photo, and none of their pixels count

@@ -110,19 +110,6 @@ class SceneFiles:
         """Return whether cameras lie in several folders below the scene, which may be several scenes."""
         return self.below and len({Path(os.path.relpath(path, self.root)).parts[0] for path in self.others}) > 1
 
-    @property
-    def choices(self) -> list[SceneFiles]:
-        """Return a copy of this object for each camera file to try, in the order in which they are tried.
-
-        Cameras in sub-folders are tried only if one sub-folder has them all, since several sub-folders may be several
-        scenes.
-        """
-        if self.is_spread:
-            return [self]
-        # Images inside the file of ``cameras`` belong only to the cameras of that file
-        images = None if self.images == self.cameras else self.images
-        return [self, *(replace(self, cameras=path, images=images, above=()) for path in self.others)]
-
     def describe_choice(self, cameras: Path | None) -> list[str]:
         """Return a list with a note that ``cameras`` are read and other cameras are not; empty without other cameras.
 
@@ -167,9 +154,7 @@ class SceneFiles:
             notes.append(f"{kinds} outside the scene's folder are not read; to read them, pass {words}")
         if self.below and self.cameras not in self.others:
             paths, option = list_some([*map(str, self.others)]), shlex.join(["--cameras", str(self.others[0])])
-            reason = (
-                "since no photo shows that they fit" if len(self.choices) > 1 else "since several folders have some"
-            )
+            reason = "since several folders have some" if self.is_spread else "since no photo shows that they fit"
             notes.append(f"cameras in folders below are not read, {reason}: {paths}; to read them, pass {option}")
         return tuple(notes)
 

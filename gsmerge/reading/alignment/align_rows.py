@@ -40,7 +40,7 @@ from gsmerge.reading.alignment.score import (
     max_correctable_px,
     pixel_errors,
 )
-from gsmerge.reading.alignment.unaligned import choose_cameras
+from gsmerge.reading.alignment.unaligned import CameraCheck, choose_cameras
 from gsmerge.reading.alignment.upright import solve_upright, upright_rotation
 from gsmerge.runtime.memory import free_pages
 from gsmerge.types import Cameras
@@ -118,6 +118,7 @@ class AlignmentResult:
     problem: str | None = None  # why the rows have no pixels; None if they have
     # Number of views that the rows form on their own, if the rows are pixels, but not of ``cameras``; else 0
     own_views: int = 0
+    sight: CameraCheck | None = None  # what the cameras see; None if rows have pixels, or if it was not measured
 
 
 def find_pixels(
@@ -294,10 +295,11 @@ def _align_without_pixels(source: RowSource, grid: Grid, frames: Callable[[], Se
     actual = f"{count} in no known order" if count == views * height * width else str(count)
     problem = f"expected one Gaussian per pixel, {expected}, found {actual}"
     remedy = "give the cameras of their views, in the frame of the Gaussians"
-    no_pixels, notes_on_choice = SceneError(source.ply.info.path, problem, remedy), list[str]()
+    no_pixels, sight, notes_on_choice = SceneError(source.ply.info.path, problem, remedy), None, list[str]()
     rotation = upright_rotation(inputs)
     if rotation is None:
-        grid, notes_on_choice = choose_cameras(replace(inputs, cameras=grid.cameras), grid, frames(), no_pixels)
+        placed = replace(inputs, cameras=grid.cameras)
+        grid, sight, notes_on_choice = choose_cameras(placed, grid, frames(), no_pixels)
     else:
         upright = solve_upright(inputs, rotation, source.ply.info.path)
         grid = replace(grid, frame=upright, shown_by="photos' colours")
@@ -317,6 +319,7 @@ def _align_without_pixels(source: RowSource, grid: Grid, frames: Callable[[], Se
         transform=grid.transform,
         problem=no_pixels.problem,
         own_views=0 if source.order == "none" else len(source.own_cameras or ()),
+        sight=sight,
     )
 
 

@@ -72,6 +72,12 @@ class CameraCheck:
         return f"{seen}, whose colours are {self.color_ratio:.2f} times as far from the photos as from random pixels"
 
 
+class UnseenError(SceneError):
+    """Raised if cameras do not see the Gaussians, or see other colours than the photos have."""
+
+    sight: CameraCheck | None = None  # what the cameras see
+
+
 def check_cameras(
     gaussians: Gaussians,
     valid: np.ndarray,
@@ -188,37 +194,40 @@ def choose_poses(
 
 def choose_cameras(
     inputs: AlignmentInput, grid: Grid, frames: Sequence[Similarity], no_pixels: SceneError
-) -> tuple[Grid, list[str]]:
+) -> tuple[Grid, CameraCheck | None, list[str]]:
     """Choose the cameras that see the Gaussians: unchanged, in another frame, or in another convention.
 
     ``frames`` are the frames that a file gives, which are tried first. The usual frames of exporters are tried next.
-    Returns the grid with these cameras, and notes. The error ``no_pixels`` explains why the rows have no pixels. If no
-    cameras see the Gaussians, ``no_pixels`` is raised, with a sentence on what was tried.
+    Returns the grid with these cameras, what they see (None if the photos' colours show another frame), and notes. The
+    error ``no_pixels`` explains why the rows have no pixels. If no cameras see the Gaussians, UnseenError says so, with
+    a sentence on what was tried.
     """
     rows = inputs.gaussians, inputs.valid
     if frames:
         tried = (IDENTITY, *frames)
         checks = [check_cameras(*rows, frame.move_cameras(inputs.cameras), inputs.images) for frame in tried]
-        best = tried[int(np.argmax([check.score * check.ok for check in checks]))]
-        if best is not IDENTITY:
-            return replace(grid, frame=best), []
+        best = int(np.argmax([check.score * check.ok for check in checks]))
+        if best > 0:
+            return replace(grid, frame=tried[best]), checks[best], []
     poses, check, note = choose_poses(*rows, inputs.cameras, inputs.images, grid.camera_file.convention)
     frame = _choose_frame(inputs, check)
     if frame is not None:
         _check_colors(inputs, frame.move_cameras(inputs.cameras), frame.description, no_pixels)
-        return replace(grid, frame=frame, shown_by="photos' colours"), []
+        return replace(grid, frame=frame, shown_by="photos' colours"), None, []
     if not check.ok:
         remedy = f"{no_pixels.remedy}, or write their shift (x y z) to offset.txt beside the file"
         remedy += ", or copy nerfstudio's dataparser_transforms.json there"
         if check.share_seen > 0.5:  # the views see most Gaussians, so only the colours contradict the cameras
             remedy += "; if the cameras are right, the photos or the colours of the file are wrong: --images none keeps"
             remedy += " the cameras, and --hint colors=rgb reads f_dc as RGB"
-        raise SceneError(no_pixels.path, f"{no_pixels.problem}; {check.description}", remedy)
+        unseen = UnseenError(no_pixels.path, f"{no_pixels.problem}; {check.description}", remedy)
+        unseen.sight = check
+        raise unseen
     if poses is None:
-        return grid, [note] if note else []
+        return grid, check, [note] if note else []
     cameras = replace(inputs.cameras, viewmats=poses.viewmats)
     _check_colors(inputs, cameras, f"read as {poses.description}", no_pixels)
-    return with_poses(grid, poses), []
+    return with_poses(grid, poses), check, []
 
 
 def _check_colors(inputs: AlignmentInput, cameras: Cameras, name: str, no_pixels: SceneError) -> None:
