@@ -12,10 +12,11 @@ from gsmerge.errors import Doubt, SceneError, list_doubts, split_notes
 from gsmerge.frozen import dataclass, replace
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.image_names import IMAGE_SUFFIXES
-from gsmerge.reading.alignment import CameraCheck
+from gsmerge.reading.alignment import ESTIMATED, CameraCheck
 from gsmerge.reading.candidates import Candidate, Views
+from gsmerge.reading.choice import ROWS, Choice, make_choice
 from gsmerge.reading.loaded import Loaded
-from gsmerge.reading.photos.scene_photos import describe_missing
+from gsmerge.reading.photos.scene_photos import MismatchError, describe_missing
 from gsmerge.reading.scene_files import SceneFiles
 from gsmerge.settings.reading import NONE
 
@@ -109,12 +110,21 @@ def find_cause(tried: Sequence[Evidence]) -> SceneError:
     return next(one.error for one in tried if one.error is not None)
 
 
+def find_best(tried: Sequence[Evidence]) -> Evidence:
+    """Return the candidate whose cameras see most of the Gaussians, or the first if none was measured."""
+    return max(tried, key=lambda one: -1.0 if one.sight is None else one.sight.score)
+
+
 def explain_refusal(tried: Sequence[Evidence]) -> SceneError:
-    """Return why no candidate is chosen, with what the user can do."""
-    cause, files = find_cause(tried), tried[0].files
+    """Return what spoke against the best candidate, if none is chosen, with what the user can do."""
+    files, best = tried[0].files, find_best(tried)
+    cause = best.error or find_cause(tried)
     options = [f"--{name} {NONE}" for name in ("cameras", "images") if name in files.named and getattr(files, name)]
     read_alone = f"{' and '.join(options)} reads the Gaussians alone" if options else ""
-    return SceneError(cause.path, cause.problem, "; ".join(filter(None, (cause.remedy, read_alone))))
+    problem, cameras = cause.problem, str(best.files.cameras or ROWS)
+    if len(tried) > 1 and cause.path != cameras:
+        problem += f" (with {cameras}, the best of {len(tried)} candidates for the cameras)"
+    return SceneError(cause.path, problem, "; ".join(filter(None, (cause.remedy, read_alone))))
 
 
 def choose_photos(shown: Evidence, bare: Evidence, views: Views) -> Evidence:
@@ -148,6 +158,75 @@ def blames_photos(shown: Evidence, views: Views) -> bool:
     is_found = "images" in views.files.named and "cameras" not in views.files.named
     is_about_cameras = shown.error is not None and shown.stored is not None and shown.error.path == shown.stored.path
     return is_found and is_about_cameras
+
+
+def give_reasons(
+    candidates: Sequence[Candidate], tried: Sequence[Evidence], chosen: Evidence | None
+) -> tuple[Choice, ...]:
+    """Say of all cameras, and of the photos of the chosen cameras, whether they were chosen and why.
+
+    If no cameras were chosen, the photos are those of the cameras that a refusal is about.
+    """
+    files, choices = candidates[0].files, list[Choice]()
+    evidence_on = {one.candidate: one for one in tried}
+    for candidate in candidates:
+        one = evidence_on.get(candidate)
+        if one is not None:
+            is_chosen = chosen is not None and chosen.candidate is candidate and one.num_views > 0
+            choices.append(make_choice(files, "cameras", _name_cameras(one), _judge(one, chosen), chosen=is_chosen))
+        elif candidate.files.cameras is not None and not candidate.way:
+            reason = "not examined, since others fit"
+            choices.append(make_choice(files, "cameras", candidate.files.cameras, reason, chosen=False))
+    for path in files.others if files.is_spread else ():
+        reason = "several folders have cameras, which may be those of several scenes"
+        choices.append(make_choice(files, "cameras", path, reason, chosen=False))
+    for kind, path in files.above:
+        reason = "outside the scene's folder"
+        choices.append(make_choice(files, {"images": "photos"}.get(kind, kind), path, reason, chosen=False))
+    best = chosen or find_best(tried)
+    if best.photo_place is None:
+        return tuple(choices)
+    reason = f"show {best.num_shown} of {best.num_views} views"
+    error = best.photo_error or best.error
+    if error is not None:
+        reason = "show none of the views" if isinstance(error, MismatchError) else error.problem
+    elif not best.has_photos:
+        reason = "no cameras say which views they show"
+    choices.append(make_choice(files, "photos", best.photo_place, reason, chosen=best.has_photos))
+    if files.images not in (None, best.photo_place, best.files.cameras):
+        reason = "another folder has the names of more views"
+        choices.append(make_choice(files, "photos", files.images, reason, chosen=False))
+    return tuple(choices)
+
+
+def _name_cameras(one: Evidence) -> Path | str:
+    """Return the path of cameras, or words for cameras without a file of their own."""
+    if one.stored is not None and one.files.cameras is None and one.stored.source != ESTIMATED:
+        return f"in {one.files.ply.name}"
+    path = one.files.cameras or ROWS
+    return f"{Path(path).name} read {one.candidate.way}" if one.candidate.way else path
+
+
+def _judge(one: Evidence, chosen: Evidence | None) -> str:
+    """Say in a few words, with the number that decided, why cameras were chosen or left out."""
+    if one.error is not None:
+        if one.photo_place is not None and Path(one.error.path).is_relative_to(one.photo_place):
+            return "the photos that were named do not show their views"
+        return one.error.problem if one.sight is None else one.sight.words
+    if one.num_views == 0:
+        return "form no grid of pixels"
+    fact = "photos have the colours of the Gaussians in their views"
+    if one.share_near is not None:
+        fact = f"{100 * one.share_near:.1f} % of the Gaussians lie near their pixels"
+    elif one.sight is not None:
+        fact = f"see {100 * one.sight.share_seen:.0f} % of the Gaussians"
+    if one.stored is not None and one.stored.source == ESTIMATED:
+        fact = f"form {one.num_views} views: {fact}"
+    if chosen is None or one.candidate is chosen.candidate:
+        return fact
+    if chosen.candidate.replaces_files and one.stored is not None:
+        return f"{fact}, but they are those of {len(one.stored)} of {chosen.num_views} views"
+    return f"{fact}, but no photo shows that they fit"
 
 
 def leave_out(evidence: Evidence, files: SceneFiles, left_out: Sequence[str], cause: SceneError) -> Evidence:

@@ -12,6 +12,7 @@ from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.formats.read_gaussians import FileInfo, kept_comments
 from gsmerge.io.formats.rows import FLAT_COMMENT
 from gsmerge.reading.alignment import Alignment, Recovery
+from gsmerge.reading.choice import Choice
 from gsmerge.reading.exporters import Exporter
 from gsmerge.reading.larger_photos import PhotoSource
 from gsmerge.reading.scene_files import SceneFiles
@@ -40,6 +41,7 @@ class Loaded:
     stats: Mapping[Path, tuple[int, ...]] = field(default_factory=dict)  # states of the files before they were read
     source: PhotoSource | None = None  # the photos as stored, until larger photos and masks are read; then None
     sha256: str | None = None  # hash of the files of Gaussians, one after the other; None if it was not asked for
+    candidates: tuple[Choice, ...] = ()  # cameras, photos and masks that may belong to the scene, with reasons
     own_views: int = 0  # number of views that the rows form, if the rows are not pixels of the cameras; else 0
 
     @property

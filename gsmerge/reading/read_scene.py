@@ -6,13 +6,22 @@ import warnings
 from typing import Any
 
 from gsmerge.errors import Doubt, DoubtWarning, SceneError, attempt, name_notes
-from gsmerge.frozen import replace
+from gsmerge.frozen import dataclass, replace
 from gsmerge.io.cameras.camera_file import to_cameras
 from gsmerge.io.formats.read_gaussians import GaussianFile, read_gaussians, read_parts
 from gsmerge.io.photo_files import NO_IMAGES, as_floats, photo_size
 from gsmerge.reading.alignment import AlignmentResult, check_cameras, check_pixels
 from gsmerge.reading.candidates import list_candidates, parse_views, read_scene_cameras
-from gsmerge.reading.choose import Evidence, certainly_fits, choose, explain_refusal, is_needed, release_spare
+from gsmerge.reading.choice import Choice
+from gsmerge.reading.choose import (
+    Evidence,
+    certainly_fits,
+    choose,
+    explain_refusal,
+    give_reasons,
+    is_needed,
+    release_spare,
+)
 from gsmerge.reading.examine import examine
 from gsmerge.reading.exporters import NO_HINTS, ReadHints, find_exporter, make_hints
 from gsmerge.reading.loaded import Loaded
@@ -26,6 +35,14 @@ from gsmerge.settings.reading import OpacityChoice
 from gsmerge.types import Scene, StrPath
 
 SUMMED_FACTS = ("file_bytes", "num_nonfinite")  # facts about files that are added up if scenes are joined
+
+
+@dataclass(frozen=True, eq=False)
+class Reading:
+    """What was decided about the cameras and photos of a scene."""
+
+    outcome: Loaded | SceneError  # the scene, or why no cameras fit
+    candidates: tuple[Choice, ...]  # all cameras and photos that may belong to it, and why they were chosen or left out
 
 
 @check_arguments
@@ -110,7 +127,10 @@ def read_files(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: Rea
 
     joined = join_scenes([load.scene for load in loads], [load.files.ply for load in loads])
     scene, used = joined.scene, [loads[i] for i in joined.used]
-    notes = [text for name, load in zip(joined.names, loads, strict=True) for text in name_notes(name, load.notes)]
+    notes, choices = list[str](), list[Choice]()
+    for name, load in zip(joined.names, loads, strict=True):
+        notes += name_notes(name, load.notes)
+        choices += [replace(choice, path=f"{name}: {choice.path}") for choice in load.candidates]
     return replace(
         used[0],
         scene=scene,
@@ -121,6 +141,7 @@ def read_files(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: Rea
         alignment=check_pixels(scene),
         moves=[move for load in used for move in load.moves],
         joined=joined.facts,
+        candidates=tuple(choices),
     )
 
 
@@ -144,35 +165,37 @@ def find_views(
     *,
     photos: bool = True,
     keeps_cameras: bool = False,
-) -> Loaded | SceneError:
-    """Find the cameras and photos of Gaussians, and the pixel of every row if rows have pixels; or say why none fit.
+) -> Reading:
+    """Find the cameras and photos of Gaussians, and the pixel of every row if rows have pixels.
 
     Candidates for the cameras are examined in order, as long as they are needed, and one is chosen by the evidence.
     Cameras and photos that were found, but do not belong to the scene, are left out with a note. With
     ``keeps_cameras``, cameras are not estimated in place of files. If ``photos`` is False, no photos are searched.
     """
-    tried = list[Evidence]()
-    for candidate in list_candidates(files, keeps_cameras=keeps_cameras):
+    candidates, tried = list_candidates(files, keeps_cameras=keeps_cameras), list[Evidence]()
+    for candidate in candidates:
         views = parse_views(ply, candidate, photos=photos) if is_needed(candidate, tried) else None
         if views is not None:
             tried.append(release_spare(examine(ply, views, hints), tried))
     chosen = choose(tried)
+    choices = give_reasons(candidates, tried, chosen)
     if chosen is None or chosen.load is None:
         refused = None if "cameras" in files.named else attempt(check_hints, ply, hints)
-        return refused or explain_refusal(tried)
+        return Reading(refused or explain_refusal(tried), choices)
     is_usual = chosen.files.cameras == files.cameras and not certainly_fits(chosen)
     on_choice = [] if is_usual else files.describe_choice(chosen.files.cameras)
-    return replace(chosen.load, notes=(*on_choice, *chosen.notes), photos_explain=chosen.photos_explain)
+    notes = (*on_choice, *chosen.notes)
+    return Reading(replace(chosen.load, notes=notes, photos_explain=chosen.photos_explain), choices)
 
 
-def finish(found: Loaded | SceneError) -> Loaded:
-    """Return a scene that was found, with confirmed colours, larger photos and masks; raise the error if none was.
+def finish(reading: Reading) -> Loaded:
+    """Return the scene that was chosen, with confirmed colours, larger photos and masks; raise SceneError if none was.
 
     Also raises SceneError for masks that cannot be used, see :func:`add_larger_and_masks`.
     """
-    if isinstance(found, SceneError):
-        raise found
-    return add_larger_and_masks(confirm_colors(found))
+    if isinstance(reading.outcome, SceneError):
+        raise reading.outcome
+    return add_larger_and_masks(replace(confirm_colors(reading.outcome), candidates=reading.candidates))
 
 
 def move_cameras_to_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHints, photos: bool) -> Loaded:

@@ -66,7 +66,12 @@ class CameraCheck:
     @property
     def description(self) -> str:
         """Description of the measures in one sentence."""
-        seen = f"the cameras see {100 * self.share_seen:.0f} % of the Gaussians"
+        return f"the cameras {self.words}"
+
+    @property
+    def words(self) -> str:
+        """The measures in the words of a sentence about cameras."""
+        seen = f"see {100 * self.share_seen:.0f} % of the Gaussians"
         if np.isnan(self.color_ratio):
             return seen
         return f"{seen}, whose colours are {self.color_ratio:.2f} times as far from the photos as from random pixels"

@@ -55,6 +55,10 @@ _CHANNEL_ROUNDING = 1 / 255  # mean difference of channels that rounding to 8 bi
 _MODEL_FOLDERS = {"sparse", "colmap", "distorted"}  # names of folders that have COLMAP's models
 
 
+class MismatchError(SceneError):
+    """Raised if no photo shows any view."""
+
+
 @dataclass(frozen=True, eq=False)
 class ScenePhotos:
     """The photo of each of c cameras, and the files from which it is chosen.
@@ -542,7 +546,7 @@ def describe_missing(names: Sequence[str], stored: CameraFile | None, *, is_righ
     return f"{text}: the poses and focal length of all views are estimated from the Gaussians' own grid"
 
 
-def explain_mismatch(photos: ScenePhotos, camera_file: CameraFile) -> SceneError:
+def explain_mismatch(photos: ScenePhotos, camera_file: CameraFile) -> MismatchError:
     """Return the error that no photo shows any view, with the names of the photos that cannot be used."""
     views = f"the {len(camera_file)} views of {camera_file.widths[0]} x {camera_file.heights[0]} pixels"
     found = "none that shows one of them"
@@ -553,7 +557,7 @@ def explain_mismatch(photos: ScenePhotos, camera_file: CameraFile) -> SceneError
     faults = [fault for fault in photos.faults if fault is not None]
     reasons = f" ({list_some(faults, '; ')})" if faults else ""
     problem = f"expected photos of {views}, found {found}{reasons}"
-    return SceneError(photos.folder, problem, "name their folder with --images")
+    return MismatchError(photos.folder, problem, "name their folder with --images")
 
 
 def without_photo(scene: Scene, views: Sequence[int]) -> Scene:

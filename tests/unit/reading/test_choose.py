@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,9 @@ from messages import noted
 
 from gsmerge.errors import Doubt, Note, SceneError
 from gsmerge.io.cameras.camera_file import CameraFile
+from gsmerge.reading.alignment import ESTIMATED, CameraCheck
 from gsmerge.reading.candidates import Candidate, Views, list_candidates
+from gsmerge.reading.choice import Choice, candidate_lines
 from gsmerge.reading.choose import (
     Evidence,
     blames_photos,
@@ -21,11 +23,12 @@ from gsmerge.reading.choose import (
     choose_photos,
     explain_refusal,
     find_cause,
+    give_reasons,
     is_needed,
     needs_bare,
     release_spare,
 )
-from gsmerge.reading.photos.scene_photos import ScenePhotos
+from gsmerge.reading.photos.scene_photos import MismatchError, ScenePhotos
 from gsmerge.reading.scene_files import SceneFiles
 
 FOLDER = Path("scene")
@@ -42,6 +45,10 @@ def stored(*names: str) -> CameraFile:
     count = len(names)
     poses, K, sides = np.tile(np.eye(4), (count, 1, 1)), np.tile(np.eye(3), (count, 1, 1)), np.ones(count, int)
     return CameraFile(str(FIRST), poses, K, sides, sides, names, "transforms.json")
+
+
+ESTIMATED_CAMERAS = replace(stored("0.png", "1.png", "2.png", "3.png"), source=ESTIMATED)
+SEES_LITTLE, SEES_HALF = CameraCheck(0.03, np.nan, ok=False), CameraCheck(0.5, np.nan, ok=True)
 
 
 def fits(candidate: Candidate = CAMERAS[0], **facts: Any) -> Evidence:
@@ -224,3 +231,85 @@ def test_a_refusal_says_what_reads_the_gaussians_alone() -> None:
     assert DAMAGED.remedy in error.remedy
     assert "--cameras none and --images none" in error.remedy
     assert explain_refusal([fails()]).remedy == DAMAGED.remedy
+
+
+def test_a_refusal_is_about_the_cameras_that_see_most() -> None:
+    little = SceneError(FILES.ply, "they see 3 %")
+    error = explain_refusal([fails(sight=SEES_LITTLE), fails(CAMERAS[1], little, sight=SEES_HALF)])
+    assert error.problem == f"{little.problem} (with {SECOND}, the best of 2 candidates for the cameras)"
+    unmeasured = explain_refusal([fails(), fails(CAMERAS[1], little)])
+    assert (unmeasured.path, unmeasured.problem) == (DAMAGED.path, DAMAGED.problem)  # the path names the candidate
+
+
+def show(choices: tuple[Choice, ...]) -> list[tuple[str, str, bool, str]]:
+    return [(one.kind, one.path, one.chosen, one.reason) for one in choices]
+
+
+def test_every_candidate_has_a_reason_and_an_option() -> None:
+    near = fits(CAMERAS[1], are_pixels=True, share_near=0.998, has_photos=True, num_shown=2, photo_place=IMAGES)
+    choices = give_reasons(CAMERAS, [fails(sight=SEES_LITTLE), near], near)
+    assert show(choices) == [
+        ("cameras", "transforms.json", False, "see 3 % of the Gaussians"),
+        ("cameras", "sparse/0", True, "99.8 % of the Gaussians lie near their pixels"),
+        ("photos", "images", True, "show 2 of 3 views"),
+    ]
+    assert [one.option for one in choices] == [f"--cameras {FIRST}", f"--cameras {SECOND}", f"--images {IMAGES}"]
+    assert candidate_lines([asdict(one) for one in choices]) == [
+        "cameras  transforms.json  left out  see 3 % of the Gaussians (--cameras scene/transforms.json)",
+        "cameras  sparse/0         chosen    99.8 % of the Gaussians lie near their pixels",
+        "photos   images           chosen    show 2 of 3 views",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("tried", "chosen", "expected"),
+    [
+        ([fits(sight=SEES_HALF)], 0, [(True, "see 50 % of the Gaussians"), (False, "not examined, since others fit")]),
+        ([fits()], 0, [(True, "photos have the colours of the Gaussians in their views"),
+                       (False, "not examined, since others fit")]),
+        ([fails(), fails(CAMERAS[1])], None, [(False, DAMAGED.problem), (False, DAMAGED.problem)]),
+        ([fits(sight=SEES_HALF), fits(CAMERAS[1], are_pixels=True, share_near=1.0)], 1,
+         [(False, "see 50 % of the Gaussians, but no photo shows that they fit"),
+          (True, "100.0 % of the Gaussians lie near their pixels")]),
+        ([fits(own_views=4, sight=SEES_HALF), fits(ROWS, num_views=4, share_near=1.0, stored=ESTIMATED_CAMERAS)], 1,
+         [(False, "see 50 % of the Gaussians, but they are those of 3 of 4 views"),
+          (False, "not examined, since others fit"),
+          (True, "form 4 views: 100.0 % of the Gaussians lie near their pixels")]),
+        ([fails(), fails(CAMERAS[1]), Evidence(ROWS)], 2,
+         [(False, DAMAGED.problem), (False, DAMAGED.problem), (False, "form no grid of pixels")]),
+        ([fails(error=OTHER_PHOTOS, photo_place=IMAGES), fails(CAMERAS[1])], None,
+         [(False, "the photos that were named do not show their views"), (False, DAMAGED.problem)]),
+    ],
+)  # fmt: skip
+def test_cameras_have_a_reason(tried: list[Evidence], chosen: int | None, expected: list[tuple[bool, str]]) -> None:
+    choices = give_reasons(CAMERAS, tried, None if chosen is None else tried[chosen])
+    assert [(one.chosen, one.reason) for one in choices if one.kind == "cameras"] == expected
+
+
+@pytest.mark.parametrize(
+    ("facts", "expected"),
+    [
+        ({"photo_error": MismatchError(IMAGES, "no photo")}, [("images", False, "show none of the views")]),
+        ({"photo_error": SceneError(IMAGES, "damaged")}, [("images", False, "damaged")]),
+        ({}, [("images", False, "no cameras say which views they show")]),
+        ({"photo_place": FOLDER / "DCIM", "has_photos": True, "num_shown": 3},
+         [("DCIM", True, "show 3 of 3 views"), ("images", False, "another folder has the names of more views")]),
+    ],
+)  # fmt: skip
+def test_photos_have_a_reason(facts: dict[str, Any], expected: list[tuple[str, bool, str]]) -> None:
+    one = fits(**({"photo_place": IMAGES} | facts))
+    choices = give_reasons(CAMERAS, [one], one)
+    assert [(photos.path, photos.chosen, photos.reason) for photos in choices if photos.kind == "photos"] == expected
+
+
+def test_files_that_are_not_searched_are_named_with_their_option() -> None:
+    a, b = FOLDER / "a/sparse", FOLDER / "b/sparse"
+    outside = ("images", FOLDER.parent / "photos")
+    candidates = list_candidates(replace(FILES, cameras=None, below=True, others=(a, b), above=(outside,)))
+    rows = Evidence(candidates[0])
+    choices = give_reasons(candidates, [rows], rows)
+    assert [(one.kind, one.option) for one in choices] == [
+        ("cameras", "--cameras none"), ("cameras", f"--cameras {a}"), ("cameras", f"--cameras {b}"),
+        ("photos", "--images photos"),
+    ]  # fmt: skip
+    assert not any(one.chosen for one in choices)
