@@ -12,7 +12,7 @@ from gsmerge.errors import SceneError, UsageError, name_notes
 def inspect(
     paths: Annotated[list[Path], opt.argument("SCENE|FILE...", "One or several scenes; also cameras, .gsm files, "
         "networks and lod-meta.json.")],
-    cameras: opt.Cameras = None, images: opt.Images = None, hint: opt.Hint = None,
+    cameras: opt.Cameras = None, images: opt.Images = None, hint: opt.Hint = None, masks: opt.Masks = None,
     threads: opt.OwnThreads = None, json: opt.Json = False, progress: opt.Progress = None,
     quiet: opt.Quiet = False,
 ) -> None:  # fmt: skip
@@ -28,7 +28,9 @@ def inspect(
         from gsmerge.runtime.record import record_run
 
         with stage_progress(quiet=silent) as on_step, record_run(on_step):
-            facts = inspect_scene(path, cameras=cameras, images=images, opacity=reading.opacity, **vars(reading.hints))
+            facts = inspect_scene(
+                path, cameras=cameras, images=images, masks=masks, opacity=reading.opacity, **vars(reading.hints)
+            )  # fmt: skip
             problems = check_content(path).problems if path.name == INDEX else ()
         described = {**document_head(), **facts, "problems": list(problems)}
         print_document(described, inspection_lines(facts), as_json=json, quiet=quiet)
@@ -38,8 +40,8 @@ def inspect(
         if problems:
             raise SceneError(path, "; ".join(problems))
         return
-    if cameras is not None or images is not None:
-        raise UsageError("--cameras and --images: expected one scene with them")
+    if any(named is not None for named in (cameras, images, masks)):
+        raise UsageError("--cameras, --images and --masks: expected one scene with them")
     checks = list[FileCheck]()
     with stage_progress(quiet=silent) as on_step:
         for path in paths:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -29,6 +29,7 @@ from gsmerge.prepare.true_pixels import raise_sizes, with_pixels
 from gsmerge.raster.photos import LEAST_OPACITY
 from gsmerge.reading.alignment import check_cameras
 from gsmerge.reading.candidates import read_scene_cameras
+from gsmerge.reading.choice import candidate_lines
 from gsmerge.reading.exporters import ReadHints, make_hints
 from gsmerge.reading.read_scene import Loaded, find_views, finish, read_gaussian_file
 from gsmerge.reading.scene_files import SceneFiles, find_scene_files
@@ -87,10 +88,12 @@ def inspect(
         (within 1e-6 of 0 or 1), ``extents``. About the views: ``cameras``, ``camera_format``, ``images``,
         ``num_views``, ``width``, ``height``, ``num_missing`` (pixels without a Gaussian), ``rows``
         (order of the rows), ``alignment`` or ``alignment_problem``, ``num_unseen`` (Gaussians of a result that no view
-        shows), ``sight``, ``coverage``, ``num_sky_views``. ``agreement``: shares of the pixels whose depth other views
-        confirm or contradict, or that no other view sees (``confirmed``, ``contradicted``, ``alone``). ``new_views`` of
-        a result: ``before``, ``after``, ``low``, ``high``, see the report of a run. ``compact``: the estimate of a run,
-        None if it would refuse the scene. ``auto``: ``share``, ``num_gaussians`` and ``why`` of ``--budget auto``.
+        shows), ``sight``, ``coverage``, ``num_sky_views``. ``candidates``: ``kind``, ``path``, ``chosen``, ``reason``
+        and ``option`` (which takes it) of the cameras, photos and masks that may belong to the scene. ``agreement``:
+        shares of the pixels whose depth other views confirm or contradict, or that no other view sees (``confirmed``,
+        ``contradicted``, ``alone``). ``new_views`` of a result: ``before``, ``after``, ``low``, ``high``, see the
+        report of a run. ``compact``: the estimate of a run, None if it would refuse the scene. ``auto``: ``share``,
+        ``num_gaussians`` and ``why`` of ``--budget auto``.
         ``notes``: warnings.
 
     Raises:
@@ -140,7 +143,11 @@ def _describe_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> d
         "coverage": [],
         "new_views": None if expected is None else asdict(expected),
     }
-    load = attempt(finish, find_views(ply, files, hints))
+    reading = find_views(ply, files, hints)
+    load = attempt(finish, reading)
+    candidates = reading.candidates if isinstance(load, SceneError) else load.candidates
+    facts["candidates"] = [asdict(choice) for choice in candidates]
+    del reading  # frees the photos as they are stored
     if isinstance(load, SceneError):
         camera_file = None if files.cameras is None else attempt(read_scene_cameras, ply, files)
         if isinstance(camera_file, CameraFile):
@@ -246,6 +253,7 @@ def inspection_lines(scene: Mapping[str, Any]) -> list[str]:
         f" {extent['diagonal']:.3g}; {100 * extent['share_huge']:.3g} % above a tenth of it",
         f"cameras    {cameras}",
         f"images     {scene['images'] or 'none found'}",
+        *_candidate_lines(scene["candidates"]),
         *_alignment_lines(scene),
         *_coverage_lines(scene),
     ]
@@ -261,6 +269,11 @@ def inspection_lines(scene: Mapping[str, Any]) -> list[str]:
         share = f"{100 * auto['share']:.3g} %, {auto['num_gaussians']:,} Gaussians"
         lines += [f"auto       --budget auto takes {share}: {auto['why']}"]
     return [line for line in lines if line] + note_lines(scene["notes"])
+
+
+def _candidate_lines(candidates: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Describe which cameras, photos and masks may belong to the scene, and why they were chosen or left out."""
+    return [f"{'' if i else 'candidates':10} {line}" for i, line in enumerate(candidate_lines(candidates))]
 
 
 def _alignment_lines(scene: Mapping[str, Any]) -> list[str]:

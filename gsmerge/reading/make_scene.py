@@ -16,10 +16,11 @@ from gsmerge.io.formats.read_gaussians import GaussianFile, file_notes
 from gsmerge.io.formats.rows import MAX_STRAY, RESULT_COMMENT
 from gsmerge.io.photo_files import NO_IMAGES, as_floats, photo_size
 from gsmerge.reading.alignment import AlignmentResult, check_pixels, find_pixels
+from gsmerge.reading.choice import make_choice
 from gsmerge.reading.exporters import ReadHints, choose_exporters, find_cameras_of_model, find_exporter
 from gsmerge.reading.larger_photos import PhotoSource, limit_photo_size, limit_view_size, read_larger_and_masks
 from gsmerge.reading.loaded import Loaded
-from gsmerge.reading.photos.masks import CameraMaskError, check_masks
+from gsmerge.reading.photos.masks import NO_MASKS, CameraMaskError, check_masks
 from gsmerge.reading.photos.scene_photos import ScenePhotos, without_photo
 from gsmerge.reading.scene_files import SceneFiles
 from gsmerge.reading.take_gaussians import take_gaussians
@@ -137,7 +138,7 @@ def check_hints(ply: GaussianFile, hints: ReadHints) -> None:
 
 
 def add_larger_and_masks(load: Loaded) -> Loaded:
-    """Add larger photos and masks to a scene whose cameras and photos are decided.
+    """Add larger photos and masks to a scene whose cameras and photos are decided, and say why masks are used or not.
 
     Masks that were found, but cannot be used, are left out with a note. Raises SceneError for masks that the caller
     named, and for masks that the camera file lists if they are photos.
@@ -145,23 +146,36 @@ def add_larger_and_masks(load: Loaded) -> Loaded:
     files, source, scene, notes = load.files, load.source, load.scene, list[str]()
     if source is None:
         return load
-    mask_options = [name for name in ("masks", "protect") if getattr(files, name) is not None]
-    if mask_options and not source.size:
-        text = f"the pictures of --{' and --'.join(mask_options)} are not used, since there are no photos"
-        notes.append(Doubt(text) if files.named.intersection(mask_options) else text)
     is_plain = "masks" in files.named and files.masks is None  # the user wants no masks
+    listed = "masks" not in files.named and any(source.camera_file.masks.values())
+    place = f"listed in {Path(source.camera_file.path).name}" if listed else files.masks
+    mask_options = [name for name in ("masks", "protect") if getattr(files, name) is not None]
+    refusal = ""
+    if mask_options and not source.size:
+        refusal = "there are no photos"
+        text = f"the pictures of --{' and --'.join(mask_options)} are not used, since {refusal}"
+        notes.append(Doubt(text) if files.named.intersection(mask_options) else text)
     read = attempt(read_larger_and_masks, files, source, scene.cameras, is_plain=is_plain)
     if isinstance(read, SceneError):
         is_protecting = files.protect is not None and Path(read.path).is_relative_to(files.protect)
         is_listed = isinstance(read, CameraMaskError) or Path(read.path) in source.photos.paths
         if "masks" in files.named or is_protecting or is_listed:
             raise read
+        refusal = read.problem
         remedy = read.remedy or f"pass --masks FOLDER, or --masks {NONE}"
-        notes.append(Doubt(f"masks are left out: {read.path}: {read.problem}; {remedy}"))
+        notes.append(Doubt(f"masks are left out: {read.path}: {refusal}; {remedy}"))
         without_masks = replace(files, masks=None, named=files.named | {"masks"})
         read = read_larger_and_masks(without_masks, source, scene.cameras)
     large, masks, mask_notes = read
-    masks, check_notes = check_masks(masks, files, scene)
+    place = "transparency" if place is None and masks.counts is not None else place
+    masks, reason, check_notes = check_masks(masks, files, scene)
+    choices = [*load.candidates]
+    if place is not None:
+        is_used = not refusal and masks is not NO_MASKS
+        choices.append(make_choice(files, "masks", place, refusal or reason, chosen=is_used))
+    if listed and files.masks is not None:
+        reason = "the camera file names others"
+        choices.append(make_choice(files, "masks", files.masks, reason, chosen=False))
     counts = masks.counts
     if scene.masks is not None:  # some views have no photo, and none of their pixels count
         counts = scene.masks if counts is None else counts & scene.masks
@@ -170,4 +184,5 @@ def add_larger_and_masks(load: Loaded) -> Loaded:
         maps if maps is not None and maps.shape == (len(scene), scene.cameras.height, scene.cameras.width) else None
     )
     scene = replace(scene, large_photos=large, masks=counts, importance=masks.importance, depths=depths)
-    return replace(load, scene=scene, source=None, notes=(*load.notes, *notes, *mask_notes, *check_notes))
+    notes = [*load.notes, *notes, *mask_notes, *check_notes]
+    return replace(load, scene=scene, source=None, notes=tuple(notes), candidates=tuple(choices))

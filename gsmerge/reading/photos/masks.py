@@ -259,8 +259,8 @@ def _describe_protected(importance: np.ndarray | None, masks: Sequence[Path | No
     return f"protect: {share:.1f} % of the photos' pixels have {weight}, by the pictures of {photos}"
 
 
-def check_masks(masks: Masks, files: SceneFiles, scene: Scene) -> tuple[Masks, list[str]]:
-    """Return the masks that are used, and notes on the share of the photos that masks leave out.
+def check_masks(masks: Masks, files: SceneFiles, scene: Scene) -> tuple[Masks, str, list[str]]:
+    """Return the masks that are used, a reason, and notes on the share of the photos that masks leave out.
 
     Masks that leave out nearly everything, or most of what the Gaussians show, are not used, unless the user named
     them: a photo's alpha may be a confidence or a depth, and masks may be inverted. Named masks that leave out nearly
@@ -268,29 +268,30 @@ def check_masks(masks: Masks, files: SceneFiles, scene: Scene) -> tuple[Masks, l
     """
     counts = masks.counts
     if counts is None:
-        return masks, []
+        return masks, "leave nothing out", []
     share = float(1 - counts.mean())  # share of the pixels that masks leave out
     max_share = 0.98  # masks that leave out more are not used
     is_named = "masks" in files.named and files.masks is not None
     where = files.masks or "transparency, or masks that the cameras' file names"
+    reason = f"leave out {100 * share:.0f} % of the photos' pixels"
     if share >= max_share:
         problem = f"expected masks that are bright where photos count, found {100 * share:.0f} % of their pixels dark"
         if is_named:
             raise SceneError(where, problem, "invert them, or name another folder with --masks")
-        return NO_MASKS, [Doubt(f"masks are not used: {where}: {problem}; name them with --masks")]
-    hides_most = 2 * _share_of_gaussians(scene, counts) < 1
-    problem = f"they leave out {100 * share:.0f} % of the photos' pixels, and most of what the Gaussians show"
-    if hides_most and is_named:
-        return masks, [f"masks {where}: {problem}; if they are bright where photos do not count, invert them"]
-    if hides_most:
+        return NO_MASKS, reason, [Doubt(f"masks are not used: {where}: {problem}; name them with --masks")]
+    if 2 * _share_of_gaussians(scene, counts) < 1:
+        reason += ", and most of what the Gaussians show"
+        if is_named:
+            return masks, reason, [
+                f"masks {where}: they {reason}; if they are bright where photos do not count, invert them"
+            ]  # fmt: skip
         remedy = (
             f"if they are right, name them with --masks, transparency saved as grey pictures; or pass --masks {NONE}"
         )
-        return NO_MASKS, [Doubt(f"masks are not used: {where}: {problem}; {remedy}")]
+        return NO_MASKS, reason, [Doubt(f"masks are not used: {where}: they {reason}; {remedy}")]
     count = int((~counts.all((1, 2))).sum())
     kind = "transparency or masks" if files.masks is None else "masks"
-    left_out = f"{kind} leave out {100 * share:.0f} % of the photos' pixels"
-    return masks, [f"{left_out}; {count} of {len(counts)} photos have a mask"]
+    return masks, reason, [f"{kind} {reason}; {count} of {len(counts)} photos have a mask"]
 
 
 def _share_of_gaussians(scene: Scene, counts: np.ndarray) -> float:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import pytest
 import scenes
 from exports import depth_map_mask, export_rows, save_export, smooth_scene
 from messages import names, noted
-from tiny_scene import Tiny, write_npz
+from tiny_scene import Tiny, write_colmap_text, write_images, write_npz
 
 from gsmerge import CompactOptions, compact, read_scene
 from gsmerge.io import read_ply, write_ply
@@ -35,6 +36,64 @@ def test_inspecting_a_scene_that_fits_reports_its_facts(tiny_folder: Path, tiny:
     low, high = (np.quantile(tiny.gaussians.means, q, axis=0).tolist() for q in (0.01, 0.99))
     assert actual["extents"]["box_low"] == pytest.approx(low, abs=1e-4)
     assert actual["extents"]["box_high"] == pytest.approx(high, abs=1e-4)
+
+
+def test_candidates_say_why_cameras_photos_and_masks_were_chosen(tiny_folder: Path, tiny: Tiny) -> None:
+    write_colmap_text(tiny_folder / "sparse/0", tiny)
+    write_images(tiny_folder / "images", replace(tiny, images=tiny.images[::-1]))
+    masks = np.full_like(tiny.images, 255)
+    masks[:, :4] = 0
+    write_images(tiny_folder / "masks", replace(tiny, images=masks))
+    facts = inspect(tiny_folder)
+    assert [(one["path"], one["chosen"]) for one in facts["candidates"]] == [
+        ("transforms.json", True), ("sparse/0", False), ("images", True), ("masks", True),
+    ]  # fmt: skip
+    assert facts["candidates"][1]["option"] == f"--cameras {tiny_folder / 'sparse/0'}"
+    lines = inspection_lines(facts)
+    first = next(i for i, line in enumerate(lines) if line.startswith("candidates"))
+    assert lines[first].startswith("candidates cameras  transforms.json  chosen    ")
+    assert lines[first].endswith(" % of the Gaussians lie near their pixels")
+    assert lines[first + 1].startswith(
+        "           cameras  sparse/0         left out  not examined, since others fit ("
+    )
+    assert lines[first + 2] == "           photos   images           chosen    show 3 of 3 views"
+    assert lines[first + 3].endswith("leave out 29 % of the photos' pixels")
+
+
+def test_candidates_that_see_nothing_or_cannot_be_read_are_left_out(tmp_path: Path) -> None:
+    smooth = smooth_scene(48, 36)
+    some = np.random.default_rng(0).permutation(3 * 36 * 48)[:2999]
+    save_export(tmp_path, smooth, export_rows(smooth, some))
+    assert [one["reason"] for one in inspect(tmp_path)["candidates"]] == [
+        "see 100 % of the Gaussians", "show 3 of 3 views",
+    ]  # fmt: skip
+    shutil.rmtree(tmp_path / "images")  # their colours would show how far the cameras are away
+    (tmp_path / "transforms.json").write_text("nonsense")
+    away = replace(smooth, c2w=smooth.c2w + np.pad([[900.0]], ((0, 3), (3, 0))))
+    write_colmap_text(tmp_path / "sparse/0", away)
+    first, second, rows = inspect(tmp_path)["candidates"]
+    assert names(first["reason"], "expected JSON")
+    assert (second["path"], second["reason"]) == ("sparse/0", "see 0 % of the Gaussians")
+    assert (rows["path"], rows["chosen"], rows["reason"]) == ("rows", False, "form no grid of pixels")
+
+
+@pytest.mark.parametrize(
+    ("level", "chosen", "reason"),
+    [(255, True, "leave nothing out"), (0, False, "leave out 100 % of the photos' pixels")],
+)
+def test_masks_have_a_reason(tiny_folder: Path, tiny: Tiny, level: int, chosen: bool, reason: str) -> None:
+    write_images(tiny_folder / "masks", replace(tiny, images=np.full_like(tiny.images, level)))
+    masks = inspect(tiny_folder)["candidates"][-1]
+    assert (masks["kind"], masks["chosen"], masks["reason"]) == ("masks", chosen, reason)
+
+
+def test_a_refused_scene_has_candidates_too(tiny_folder: Path, tiny: Tiny, tmp_path: Path) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, tiny.images.shape, np.uint8)
+    write_images(tmp_path / "others", replace(tiny, images=noise))
+    facts = inspect(tiny_folder, images=tmp_path / "others")
+    assert facts["compact"] is None
+    assert [(one["kind"], one["chosen"]) for one in facts["candidates"]] == [("cameras", False), ("photos", False)]
+    assert facts["candidates"][1]["reason"] == "show none of the views"
 
 
 def test_a_ply_without_cameras_has_an_alignment_problem(tmp_path: Path, tiny: Tiny) -> None:
