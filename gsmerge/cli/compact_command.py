@@ -14,7 +14,7 @@ from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import print_document, say, say_notes, separate_stdout, stage_progress, terminal_columns
 from gsmerge.cli.paths import check_outputs, input_files, output_file
 from gsmerge.errors import Doubt, TargetError, UsageError, split_notes
-from gsmerge.frozen import dataclass, replace
+from gsmerge.frozen import asdict, dataclass, replace
 from gsmerge.settings.compact import CHECKPOINTS, CompactOptions
 from gsmerge.settings.files import FileOptions
 from gsmerge.settings.reading import NONE
@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 SETTINGS = (CompactOptions, FileOptions, Engine)
 REMEDY = "more Gaussians (--k, --budget) or a longer fit (--effort) show them better"
 # Arguments and options that also apply if the input is a .gsm of Feature Gaussians
-FEATURE_OPTIONS = ("scenes", "k", "set", "output", "overwrite", "dry_run", "open", "json", "quiet", "threads",
-                   "progress")  # fmt: skip
+FEATURE_OPTIONS = ("scenes", "k", "set", "output", "overwrite", "dry_run", "open", "json", "verbose", "quiet",
+                   "threads", "progress")  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -42,6 +42,7 @@ class Run:
     dry_run: bool
     strict: bool
     json: bool
+    verbose: bool
     quiet: bool
     has_page: bool  # true if a page will show the result
 
@@ -67,7 +68,7 @@ def compact(
         "and open it in the browser, or with --no-open only make it.", "--open/--no-open",
         default="no page; --open for gsmerge SCENE")] = None,
     seed: opt.Seed = None, threads: opt.Threads = None, json: opt.Json = False, progress: opt.Progress = None,
-    quiet: opt.Quiet = False,
+    verbose: opt.Verbose = False, quiet: opt.Quiet = False,
 ) -> None:  # fmt: skip
     """Write a compact scene that renders like the given one, or better, with 1 to 10 % of its Gaussians."""
     start = perf_counter()
@@ -91,7 +92,7 @@ def compact(
     source = features or _find_files(scenes, output, cameras, images=images, masks=masks, protect=protect)
     ply = source if isinstance(source, Path) else source.base
     out = output_file(output or ply.parent, f"{ply.stem}.compact.ply")
-    run = Run(scenes[0], out, start, overwrite, dry_run, strict, json, quiet, has_page=open is not None)
+    run = Run(scenes[0], out, start, overwrite, dry_run, strict, json, verbose, quiet, has_page=open is not None)
     # A page cannot show joined scenes or Feature Gaussians, so only the result is shown
     on_page = [scenes[0], out] if features is None and len(scenes) == 1 else [out]
     if run.has_page and os.path.exists(out) and not (overwrite or dry_run):
@@ -140,6 +141,7 @@ def _compact_files(
         from gsmerge.reading.input import read_input
 
         load = read_input(files, opacity=reading.opacity, hints=reading.hints)
+        _print_candidates(load, run)
         with opt.usage_errors():
             estimate = estimate_files(load, settings, outputs)
         print_document(estimate, dry_run_lines(estimate), as_json=run.json)
@@ -159,8 +161,17 @@ def _compact_files(
             files, settings, outputs, opacity=reading.opacity, hints=reading.hints, progress=progress,
             hashed=run.json, seconds_before=seconds_before, on_read=loads.append,
         )  # fmt: skip
+    _print_candidates(loads[0], run)
     _print_result(document, run)
     return loads[0]
+
+
+def _print_candidates(load: "Loaded", run: Run) -> None:
+    """With ``--verbose``, print which cameras, photos and masks were tried, and why they are used or left out."""
+    from gsmerge.reading.choice import candidate_lines
+
+    for line in candidate_lines([asdict(choice) for choice in load.candidates]) if run.verbose else ():
+        say(line, quiet=run.quiet)
 
 
 def _show_page(on_page: Sequence[Path], loaded: "Loaded | None", run: Run, *, open: bool) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from gsmerge.errors import list_doubts
-from gsmerge.frozen import dataclass, field
+from gsmerge.frozen import asdict, dataclass, field
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.formats.read_gaussians import FileInfo, kept_comments
 from gsmerge.io.formats.rows import FLAT_COMMENT
@@ -70,6 +70,7 @@ class Loaded:
             "exporters": [entry.name for entry in self.exporters],
             "rows": recovery and recovery.description,
             "moved_cameras": list(self.moves),
+            "candidates": [asdict(choice) for choice in self.candidates if choice.chosen],
         }
         if self.files.parts:
             facts["parts"] = [str(path) for path in self.files.parts]

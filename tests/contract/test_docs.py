@@ -213,6 +213,7 @@ def test_every_option_is_a_field_of_the_api() -> None:
         "no-open",
         "progress",
         "json",
+        "verbose",
         "quiet",
     }
     own |= set(flat_settings(PlacementOptions))  # of what is written, in whose frame nothing else is done

@@ -23,7 +23,7 @@ LAB: dict[str, Any] = TOP["lab"].commands
 COMMANDS = {name: command for name, command in TOP.items() if name != "lab"}
 COMMANDS |= {f"lab {name}": command for name, command in LAB.items()}
 # Options of all commands, of which each has --threads, --progress, --json and --quiet, and those of compact
-FEW, OF_COMPACT = 157, 24
+FEW, OF_COMPACT = 158, 25
 
 
 def shown(command: str, name: str) -> str:

@@ -56,6 +56,23 @@ def test_json_report_describes_input_output_and_run(smallest_copy: Path, run: Ru
     assert document["peak_memory_bytes"] > 1e7
 
 
+def test_verbose_and_the_report_say_why_files_are_used(smallest_copy: Path, run: Run) -> None:
+    (smallest_copy / "sparse/0").mkdir(parents=True)
+    for name in ("cameras.txt", "images.txt", "points3D.txt"):
+        (smallest_copy / "sparse/0" / name).write_text("")
+    words = ("compact", smallest_copy, "-o", smallest_copy / "small.ply", *QUICK, "--json", "--overwrite")
+    outcome = run(*words, "-v", code=0)
+    cameras, others, photos = outcome.err.splitlines()
+    assert re.fullmatch(r"cameras +transforms.json +chosen +[\d.]+ % of the Gaussians lie near their pixels", cameras)
+    assert re.match(r"cameras +sparse/0 +left out +not examined, since others fit", others)
+    assert re.fullmatch(r"photos +images +chosen +show 3 of 3 views", photos)
+    used = json.loads(outcome.out)["input"]["candidates"]
+    assert [(one["kind"], one["path"]) for one in used] == [("cameras", "transforms.json"), ("photos", "images")]
+    assert used[1]["reason"] == "show 3 of 3 views"
+    assert run(*words, "-v", "-q", code=0).err == ""
+    assert "transforms.json" in run(*words, "-v", "--dry-run", code=0).err
+
+
 def test_a_scene_too_large_for_the_machine_is_noted_before_it_is_read(
     smallest_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
