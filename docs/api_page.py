@@ -12,7 +12,16 @@ import gsmerge
 import gsmerge.integrations
 
 TOPICS = {
-    "Read": ("read_scene", "read_ply", "read_gaussians", "read_cameras", "to_cameras", "inspect"),
+    "Read": (
+        "read_scene",
+        "load_scene",
+        "read_held_out",
+        "read_ply",
+        "read_gaussians",
+        "read_cameras",
+        "to_cameras",
+        "inspect",
+    ),
     "Compact": ("compact", "compact_tensors", "CompactOptions", "CompactResult", "CompactReport"),
     "Write": ("write_ply", "write_gaussians", "write_levels"),
     "Draw and measure": (

@@ -34,6 +34,8 @@ if TYPE_CHECKING:
     from gsmerge.jobs.tensors import compact_tensors as compact_tensors
     from gsmerge.raster import Rendering as Rendering
     from gsmerge.raster import render as render
+    from gsmerge.reading.held_out import read_held_out as read_held_out
+    from gsmerge.reading.read_scene import load_scene as load_scene
     from gsmerge.reading.read_scene import read_scene as read_scene
     from gsmerge.results.report import CompactReport as CompactReport
     from gsmerge.results.result import CompactResult as CompactResult
@@ -63,7 +65,8 @@ _PUBLIC = {
     "drawing.pages.view": ("view",),
     "jobs.states.compactor": ("Compactor",),
     "raster": ("Rendering", "render"),
-    "reading.read_scene": ("read_scene",),
+    "reading.held_out": ("read_held_out",),
+    "reading.read_scene": ("load_scene", "read_scene"),
     "settings.compact": ("CompactOptions",),
     "settings.evaluate": ("EvaluateOptions",),
     "stages.superpixels": ("saliency", "superpixels"),

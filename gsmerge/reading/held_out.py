@@ -26,7 +26,11 @@ _OPTION = "evaluate --target-images"  # `gsmerge view` does not have this option
 
 @dataclass(frozen=True)
 class HeldOutViews(Views):
-    """Held-out views, from which the scene was not made, in the frame of its Gaussians."""
+    """Views from which a scene was not made, in the frame of its Gaussians; :class:`Views` with facts about their file.
+
+    ``places`` are their indices in the camera file. ``context_places`` are the indices of the scene's own views in this
+    file; None if it lacks one. ``notes`` say what was adapted.
+    """
 
     places: tuple[int, ...]  # index of each held-out view in the camera file, which is its place along the trajectory
     context_places: tuple[int, ...] | None  # index in this file of each view of the scene; None if it lacks a view
@@ -39,8 +43,23 @@ def read_held_out(load: Loaded, cameras: StrPath, images: StrPath | None = None)
     Views from which the scene was made are left out. If the file has views of the scene under the same names, their
     poses show how the file's world maps to the world of the Gaussians. If the poses of shared names show no such map,
     the file is assumed to be in the world of the scene's own cameras. Poses are read in the convention in which the
-    scene's cameras fit. ``images`` is the folder of the photos; if ``images`` is None, the camera file names the
-    photos. Raises SceneError if a file is missing or damaged, or if no view remains.
+    scene's cameras fit.
+
+    Args:
+        load: The scene, from :func:`load_scene`.
+        cameras: Camera file or folder of the held-out photos.
+        images: Folder of the photos; None: the camera file names them.
+
+    Returns:
+        :class:`Views` of the scene's world, with ``places``: the index of each view in the camera file.
+
+    Raises:
+        SceneError: If a file is missing or damaged, or if no view remains.
+
+    Example:
+        >>> held_out = gsmerge.read_held_out(gsmerge.load_scene("demo"), "demo/targets")
+        >>> len(held_out.cameras), held_out.images.shape
+        (4, (4, 32, 48, 3))
     """
     path = Path(cameras)
     if not path.exists():

@@ -21,7 +21,12 @@ from gsmerge.types import Scene
 
 @dataclass(frozen=True)
 class Loaded:
-    """A scene, with all facts about its files and how these files were read."""
+    """A scene, with all facts about its files and how these files were read.
+
+    ``scene`` is the :class:`Scene`, and ``notes`` say what was adapted. ``candidates`` have ``kind``, ``path``,
+    ``chosen``, ``reason`` and ``option`` of the cameras, photos and masks that may belong to the scene. ``info`` is
+    about the file of Gaussians, ``files`` has the paths, and ``alignment`` says how near Gaussians lie to their pixels.
+    """
 
     scene: Scene  # with pixels if the rows have them
     info: FileInfo  # header and encodings of the file of Gaussians

@@ -106,7 +106,20 @@ def load_scene(
     opacity: OpacityChoice = "auto",
     **hints: Any,
 ) -> Loaded:
-    """Read a scene as :func:`read_scene` does, and return it with all facts about its files."""
+    """Read a scene as :func:`read_scene` does, and return it with all facts about its files.
+
+    Args and errors are those of :func:`read_scene`. No warning is given; doubts are among the ``notes``.
+
+    Returns:
+        The scene as ``scene``, the ``notes``, and ``candidates``: which cameras, photos and masks may belong to the
+        scene, whether they are used, and why.
+
+    Example:
+        >>> for choice in gsmerge.load_scene("demo").candidates:
+        ...     print(choice.kind, choice.path, choice.chosen)
+        cameras transforms.json True
+        photos images True
+    """
     read_hints = make_hints(hints)
     named = {"cameras": cameras, "images": images, "masks": masks, "protect": protect}
     first, *others = (find_scene_files(scene_path, **named) for scene_path in (path, *more))
