@@ -13,7 +13,7 @@ import typer
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import print_document, say, say_notes, separate_stdout, stage_progress, terminal_columns
 from gsmerge.cli.paths import check_outputs, input_files, output_file
-from gsmerge.errors import Doubt, TargetError, UsageError, split_notes
+from gsmerge.errors import Doubt, SceneError, TargetError, UsageError, split_notes
 from gsmerge.frozen import asdict, dataclass, replace
 from gsmerge.settings.compact import CHECKPOINTS, CompactOptions
 from gsmerge.settings.files import FileOptions
@@ -242,8 +242,8 @@ def _decode_features(context: typer.Context, path: Path, given: opt.Given, run: 
 def _find_files(scenes: Sequence[Path], output: Path | None, cameras: Any, **named: Any) -> "SceneFiles":
     """Find the files of a scene, and of further scenes to join with it: those named, or those beside each scene.
 
-    Raises UsageError for several scenes if ``--cameras`` names one file for all, or if a scene is missing, given twice,
-    or a result.
+    Raises UsageError for several scenes if ``--cameras`` names one file for all, or if a scene is given twice or is a
+    result, and SceneError if one is missing.
     """
     from gsmerge.io.formats.ply import header_content
     from gsmerge.reading.scene_files import find_scene_files
@@ -251,10 +251,11 @@ def _find_files(scenes: Sequence[Path], output: Path | None, cameras: Any, **nam
     if len(scenes) > 1 and cameras not in (None, NONE):
         problem = "--cameras: expected one scene with it, got several"
         raise UsageError(f"{problem}; the cameras of several scenes are read from beside or inside them")
-    remedy = "" if output else "; name the output with -o"
+    advice = "" if output else "name the output with -o"
+    remedy = f"; {advice}" if advice else ""
     for i, scene in enumerate(scenes if len(scenes) > 1 else ()):
         if not os.path.lexists(scene):
-            raise UsageError(f"{scene}: no such scene{remedy}")
+            raise SceneError(scene, "no such file", advice)
         if any(os.path.realpath(scene) == os.path.realpath(other) for other in scenes[:i]):
             raise UsageError(f"{scene}: expected each scene once, got it twice{remedy}")
         if scene.is_file() and header_content(scene) == "result":

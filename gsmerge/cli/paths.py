@@ -14,12 +14,8 @@ if TYPE_CHECKING:
 
 
 def output_file(output: Path, name: str) -> Path:
-    """Return the file to write: ``output`` itself or, if it is a folder, the file ``name`` in it.
-
-    An output without an ending is a folder, unless a file of this name exists.
-    """
-    is_folder = output.is_dir() or not (output.suffix or os.path.lexists(output))
-    return output / name if is_folder else output
+    """Return the file to write: ``output`` itself or, if it is a folder that exists, the file ``name`` in it."""
+    return output / name if output.is_dir() else output
 
 
 def check_outputs(

@@ -99,6 +99,17 @@ def test_a_lack_of_memory_is_no_damage(
     assert_refused(run(*words), 3, "", OUT_OF_MEMORY)
 
 
+@pytest.mark.parametrize(
+    "words",
+    ["compact nowhere.ply", "compact {} nowhere.ply", "compact nowhere.ply {}", "inspect nowhere.ply",
+     "convert {} nowhere.ply -o out.ply", "render {} nowhere.ply -o out.png", "view nowhere.ply",
+     "evaluate {} nowhere.ply", "batch nowhere.ply -o out", "compact {} --cameras nowhere.ply"],
+)  # fmt: skip
+def test_a_missing_file_is_bad_input_in_every_command(words: str, smallest_copy: Path, run: Run) -> None:
+    scene = str(smallest_copy / "scene.ply")
+    assert_refused(run(*(scene if word == "{}" else word for word in words.split())), 3, "nowhere.ply", "no such file")
+
+
 def test_debug_shows_the_traceback(smallest_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("gsmerge.road.compact_scene", Broken(KeyError("lost")))
     outcome = run("compact", smallest_copy, "--quiet", "--debug", code=1)

@@ -75,7 +75,7 @@ def test_files_that_cannot_be_joined_are_refused(run: Run, sharp: Path, tmp_path
     photos = ("--images", sharp / "photos")
     refused = run("compact", first, stranger, *photos, "-o", out, "-q")
     assert_refused(refused, 3, first, "two of 2", "--images")
-    assert_refused(run("compact", first, tmp_path / "small.ply"), 2, "small.ply", "-o")
+    assert_refused(run("compact", first, tmp_path / "small.ply"), 3, "small.ply", "-o")
     assert_refused(run("compact", first, second, first, "-o", out), 2, first, "twice")
     assert_refused(run("compact", first, second, "--cameras", sharp / "made"), 2, "--cameras", "one scene")
     assert_refused(run("compact", first, second, "-o", second, "--overwrite"), 2, second, "input")

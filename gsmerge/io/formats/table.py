@@ -247,7 +247,7 @@ def output_format(path: StrPath, *, alone: bool = False) -> Format:
         read_only = "" if format_ is None else f"{format_.ending} can be read but not written; "
         pages = [row.ending for row in FORMATS if row.has_cameras and row.ending[0] == "."]
         endings = join_words(OUTPUT_FORMATS if alone else (*OUTPUT_FORMATS, *pages))
-        others = "" if alone else f", or the name {INDEX} or {TILESET.ending}, or a folder"
+        others = "" if alone else f", or the name {INDEX} or {TILESET.ending}, or a folder that exists"
         raise UsageError(f"{path}: {read_only}expected a name that ends in {endings}{others}")
     format_.require()
     return format_

@@ -91,7 +91,7 @@ def test_page_without_cameras_lets_one_look_from_any_side() -> None:
 @pytest.mark.parametrize(
     ("output", "expected"),
     [
-        ("new", "new/a.ply"),
+        ("new", "new"),  # which no format names, since no folder is made for a name without an ending
         ("empty", "empty/a.ply"),
         ("full.dir", "full.dir/a.ply"),  # whatever it holds: a page, or the rest of a killed run
         ("file", "file"),  # which no format names
