@@ -253,9 +253,10 @@ RunProgress = Callable[[RunEnd], None]
 
 @contextmanager
 def total_progress(total: int, *, quiet: bool) -> Iterator[RunProgress]:
-    """Show one bar for many runs on stderr, with the time left, and print each failure.
+    """Show one bar for many runs on stderr, with the time left, and print the name of each run that failed.
 
-    Without a terminal a line is printed for each run. Yields a function to call at the end of each run.
+    Without a terminal a line is printed for each run. Why runs failed is printed once, after the last one. Yields a
+    function to call at the end of each run.
     """
     json_lines = _json_lines.get()
     console = _terminal(quiet=quiet or json_lines is not None)
@@ -274,8 +275,7 @@ def total_progress(total: int, *, quiet: bool) -> Iterator[RunProgress]:
     elif console is None:
 
         def print_line(end: RunEnd) -> None:
-            text = end.status if end.failure.startswith(end.name) else end.text
-            say(f"{end.done}/{total} {text}{f': {end.failure}' if end.failure else ''}", quiet=quiet)
+            say(f"{end.done}/{total} {end.text}", quiet=quiet)
 
         yield print_line
     else:
@@ -291,6 +291,6 @@ def total_progress(total: int, *, quiet: bool) -> Iterator[RunProgress]:
             def move_bar(end: RunEnd) -> None:
                 bars.update(task, completed=end.done, description=one_line(end.text))
                 if end.failure:
-                    bars.console.print(one_line(f"{end.name}: {end.failure}"), markup=False, highlight=False)
+                    bars.console.print(one_line(end.text), markup=False, highlight=False)
 
             yield move_bar
