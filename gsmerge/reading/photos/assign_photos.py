@@ -149,7 +149,8 @@ class Assigner:
         rejected; and whether the comparison confirms the photo. A photo is rejected
 
         - if another orientation, or another photo that no other view needs, scores clearly higher in its view,
-        - if it scores no higher than wrong pairs do, or
+        - if it scores no higher than wrong pairs do, unless it fits its view better than all other photos do, and
+          better than it fits all other views, in all orientations, or
         - if its parts lie farther from their places than the parts of the other proposed photos do.
 
         Noisy Gaussians lower the scores of all photos and displace the parts of photos. The thresholds of rejection
@@ -177,7 +178,10 @@ class Assigner:
         for row, (view, assignment) in enumerate(proposed.items()):
             score, highest = own[row], max(best[row, row], best[row, matched[row]])
             correlation = scores.correlations[view, columns[row], assignment.orientation]
-            is_similar = score > least or correlation**2 > MIN_EXPLAINED
+            # Few wrong pairs measure the noise badly, but a wrong photo hardly is the first in both of these ranks
+            rivals = np.concatenate([scores.values[view].reshape(-1), scores.values[:, columns[row]].reshape(-1)])
+            is_first = len(columns) > 1 and score >= np.nan_to_num(rivals, nan=-np.inf).max()
+            is_similar = score > least or correlation**2 > MIN_EXPLAINED or is_first
             matches = is_similar and score > highest - SIGNIFICANT
             is_clear = score > NOISE_MARGIN and score >= highest
             # a photo that is portrait or landscape as the views are

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from panoramas import cut_views, show, shrunk, take_photos
 
-from gsmerge.kernels.pictures import turn_back
+from gsmerge.kernels.pictures import blur, turn_back
 from gsmerge.reading.photos.assign_photos import FIRST_PHOTOS, Assigner, Assignment, Candidates, assign_photos
 from gsmerge.reading.photos.offsets import OFFSET_PIXELS, find_offsets
 
@@ -175,3 +175,15 @@ def test_a_view_that_shows_nothing_contradicts_no_name(views: np.ndarray, photos
         named = [0, 1, photo, 3, 4, 5]
         chosen, _ = assign_photos(lambda side: show(views, side, weights), candidates, named, exact=True)
         assert chosen == [Assignment(0, 0), Assignment(1, 0), expected, *(Assignment(view, 0) for view in (3, 4, 5))]
+
+
+@pytest.mark.parametrize("seed", [0, 6, 12])
+def test_a_weak_photo_of_three_is_kept_where_it_fits_first_and_a_wrong_one_is_not(seed: int) -> None:
+    """Three smooth photos give few wrong pairs, whose noise says little, so that scores alone reject a right photo."""
+    smooth, other = (
+        np.stack([blur(view, 20) for view in cut_views(3, number)]).astype(np.float32) for number in (seed, 50 + seed)
+    )
+    for share, expected in ((0.25, Assignment(1, 0)), (0.0, None)):  # of the view, in its photo
+        shares = np.array([0.8, share, 0.8], np.float32)[:, None, None, None]
+        pool = list(take_photos(shares * smooth + (1 - shares) * other))
+        assert assign(smooth, pool, [0, 1, 2], exact=True)[1] == expected
