@@ -20,7 +20,7 @@ from typing import IO, Any, Literal
 import numpy as np
 from plyfile import PlyData, PlyElementParseError, PlyParseError
 
-from gsmerge.errors import SceneError, UsageError
+from gsmerge.errors import SceneError, UsageError, count_words
 from gsmerge.io.bounds import ReadBudget, read_budget, read_errors
 from gsmerge.io.formats import rows as arrays
 from gsmerge.io.formats.columns import check_columns
@@ -96,6 +96,8 @@ def read_rows(path: Path) -> arrays.StoredRows:
         f"element {name}" for name in extra_elements if elements[name].columns.keys() >= {"opacity", arrays.QUATS[0]}
     ]
     unused = check_columns(path, rows.dtype, layers)
+    if not is_compressed:
+        _check_places(path, rows)
     names, comments = tuple(rows.dtype.names or ()), tuple(header.comments)
     colors = arrays.color_columns(names)
     rest, white, notes = {name for name in names if name.startswith("f_rest_")}, 1.0, list[str]()
@@ -135,6 +137,39 @@ def read_rows(path: Path) -> arrays.StoredRows:
         ),
         adapt=partial(_adapt_rows, white=white) if notes else None,
     )
+
+
+def _check_places(path: Path, rows: arrays.Rows) -> None:
+    """Raise SceneError if the values of some rows stand beside the columns of their names.
+
+    Unit quaternions show it: in a shifted file they have norm 1 in the wrong columns, in all rows that are looked at. A
+    file whose quaternions are not normalised is not judged.
+    """
+    names, sampled = rows.dtype.names or (), rows[:1000]
+    first, types = names.index(arrays.QUATS[0]), {rows.dtype[name] for name in names}
+    are_floats = len(types) == 1 and types.pop().kind == "f"
+    if not are_floats or names[first : first + 4] != tuple(arrays.QUATS) or len(sampled) < 3:
+        return
+    with np.errstate(all="ignore"):  # values may be NaN or infinite
+        values = np.stack([sampled[name].astype(np.float64) for name in names], 1)
+
+    def are_unit(shift: int, axis: int | None) -> bool:
+        """Return whether quaternions have norm 1 after all values move to the left, in their row or along all rows."""
+        rounding = 1e-3  # of norms; half floats round them to this
+        quats = np.roll(values, -shift, axis)[1:-1, first : first + 4]
+        with np.errstate(all="ignore"):
+            return bool((np.abs((quats * quats).sum(1) - 1) < 2 * rounding).all())
+
+    if are_unit(0, 1):
+        return
+    for shift in (1, -1, 2, -2, 3, -3):
+        if are_unit(shift, 1) or are_unit(shift, None):
+            side = "after" if shift > 0 else "before"
+            places = count_words(abs(shift), "place", f"{side} their columns")
+            problem = (
+                f"expected rotations in {arrays.QUATS[0]} to {arrays.QUATS[3]}, found all values of a row {places}"
+            )
+            raise SceneError(path, problem, "copy or export it again")
 
 
 def read_columns(rows: arrays.Rows, names: Sequence[str]) -> np.ndarray:

@@ -141,3 +141,26 @@ def test_decimal_commas_or_unknown_types_are_refused(
     path.write_bytes(text.replace(old, new))
     with refuses(SceneError, "a.ply", *said):
         read_ply(path)
+
+
+def quats_at(shift: int, axis: int | None, *, unit: bool = True) -> np.ndarray:
+    """Return rows of unit quaternions, whose values are moved to the right, in their row or along all rows."""
+    rng = np.random.default_rng(0)
+    values = rng.uniform(-2, 2, (9, len(NAMES)))
+    quats = values[:, NAMES.index("rot_0") :][:, :4]
+    quats /= np.linalg.norm(quats, axis=1, keepdims=True) if unit else 1.0
+    moved = np.roll(values, shift, axis).astype("<f4")
+    return moved.view([(name, "<f4") for name in NAMES])[:, 0]
+
+
+@pytest.mark.parametrize("axis", [1, None], ids=["in each row", "along all rows"])
+@pytest.mark.parametrize(("shift", "words"), [(1, "1 place after"), (-1, "1 place before"), (3, "3 places after")])
+def test_values_beside_their_columns_are_refused(shift: int, words: str, axis: int | None, tmp_path: Path) -> None:
+    with refuses(SceneError, "a.ply", "rot_0", words):
+        read_ply(save(tmp_path / "a.ply", quats_at(shift, axis)))
+
+
+def test_quaternions_of_any_norm_are_read(tmp_path: Path) -> None:
+    assert len(read_ply(save(tmp_path / "a.ply", quats_at(0, 1))).gaussians) == 9
+    assert len(read_ply(save(tmp_path / "b.ply", quats_at(0, 1, unit=False))).gaussians) == 9
+    assert len(read_ply(save(tmp_path / "c.ply", quats_at(1, 1, unit=False))).gaussians) == 9
