@@ -28,7 +28,7 @@ from gsmerge.io.photo_files import (
 )
 from gsmerge.kernels.pictures import turn_picture
 from gsmerge.reading.photos.offsets import OFFSET_PIXELS
-from gsmerge.reading.photos.scene_photos import ScenePhotos
+from gsmerge.reading.photos.scene_photos import ScenePhotos, is_grey
 from gsmerge.reading.scene_files import SceneFiles
 from gsmerge.runtime.record import list_some
 from gsmerge.runtime.threads import parallel_map
@@ -102,7 +102,8 @@ class MaskFiles:
     def _read_levels(self, mask: Path, view: int) -> np.ndarray:
         """Read the brightness of a mask, and turn it upright if it has the orientation of the photo's file."""
         photo = self.photos[view] if self.photos else None
-        whole, turns = decode_levels(mask, photo), self.turns[view]
+        opaque = _read_cutout(mask)
+        whole, turns = decode_levels(mask, photo) if opaque is None else opaque * _WHITE, self.turns[view]
         if photo is not None:
             size = image_size(photo)
             if turns % 2 and same_shape(size, whole.shape[1::-1]):
@@ -205,10 +206,12 @@ def _refuse_photos(
 def _doubt_mask(mask: Path, photos: PhotoArrays, view: int) -> float:
     """Return infinity if a mask is a photo for certain, 1 if it may be a photo, and 0 otherwise.
 
-    A picture of several colours is a photo for certain. A grey picture may be a photo if it changes from pixel to pixel
-    as the photo of its view does. If most pixels of a picture have one of two levels, it is a mask with soft edges and
-    no photo.
+    A photo with a transparent background is a mask, see :func:`_read_cutout`. Another picture of several colours is a
+    photo for certain. A grey picture may be a photo if it changes from pixel to pixel as the photo of its view does. If
+    most pixels of a picture have one of two levels, it is a mask with soft edges and no photo.
     """
+    if _read_cutout(mask) is not None:
+        return 0
     picture = np.rint(decode_small(mask, OFFSET_PIXELS) * _WHITE)
     spread = np.ptp(picture, axis=-1)
     if spread.mean() > 1:
@@ -224,6 +227,12 @@ def _doubt_mask(mask: Path, photos: PhotoArrays, view: int) -> float:
     )
     jpeg_texture = 0.2  # largest share of the pixels of a smooth mask that JPEG makes uneven
     return _texture(grey) > max(_texture(small.mean(-1)) / 2, jpeg_texture)
+
+
+def _read_cutout(mask: Path) -> np.ndarray | None:
+    """Return where a mask is opaque ``[h,w]`` if it is a photo with a transparent background; otherwise None."""
+    opaque = decode_alpha(mask)
+    return None if opaque is None or is_grey(mask) else opaque
 
 
 def _texture(grey: np.ndarray) -> float:

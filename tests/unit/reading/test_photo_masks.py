@@ -127,6 +127,17 @@ def test_masks_of_many_bits_and_of_transparency_are_read(tmp_path: Path) -> None
     assert decode_levels(tmp_path / "clear.png").tolist() == [[0, 0, 255, 255]]
 
 
+@pytest.mark.parametrize("level", [0, 255], ids=["before black", "before white"])
+def test_photos_without_their_background_are_masks(tiny_folder: Path, tiny: Tiny, tmp_path: Path, level: int) -> None:
+    """As tools that cut out an object write them; their colours are those of the photos."""
+    for name, image in zip(tiny.names, tiny.images, strict=True):
+        seen = np.where(half(tiny)[..., None], image, level)[..., ::-1].astype(np.uint8)
+        write(tmp_path / "cut" / name, np.dstack([seen, half(tiny).astype(np.uint8) * 255]))
+    load = load_scene(tiny_folder, masks=tmp_path / "cut")
+    assert np.array_equal(load.scene.masks, np.stack([half(tiny)] * 3))
+    assert (load.candidates[-1].kind, load.candidates[-1].chosen) == ("masks", True)
+
+
 def test_a_folder_of_other_masks_beside_the_photos_is_not_used(tiny_folder: Path, tiny: Tiny) -> None:
     write(tiny_folder / "masks" / "object_0.png", half(tiny).astype(np.uint8) * 255)
     load = load_scene(tiny_folder)
