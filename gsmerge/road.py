@@ -26,8 +26,8 @@ from gsmerge.prepare.crop import crop_scene
 from gsmerge.prepare.prepare_scene import Prepared, prepare
 from gsmerge.prepare.row_colors import RENDERS
 from gsmerge.prepare.scene_size import measure_size
-from gsmerge.reading.content_hash import doubt_changed
 from gsmerge.reading.exporters import NO_HINTS, ReadHints
+from gsmerge.reading.file_stats import doubt_changed
 from gsmerge.reading.input import as_scene, read_input
 from gsmerge.reading.read_scene import Loaded
 from gsmerge.reading.scene_files import SceneFiles, scene_title

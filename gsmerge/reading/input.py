@@ -13,8 +13,8 @@ from gsmerge.io.cameras.camera_file import check_camera
 from gsmerge.io.formats.columns import list_names
 from gsmerge.io.formats.ply import is_from_gsmerge
 from gsmerge.io.formats.rows import RESULT_COMMENT
-from gsmerge.reading.content_hash import list_changed, read_stats
 from gsmerge.reading.exporters import NO_HINTS, ReadHints
+from gsmerge.reading.file_stats import list_changed, read_stats
 from gsmerge.reading.read_scene import Loaded, load_scene, read_files
 from gsmerge.reading.scene_files import SceneFiles, result_cameras
 from gsmerge.runtime.documents import file_sha256

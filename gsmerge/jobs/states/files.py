@@ -16,12 +16,13 @@ from gsmerge.io.formats.rows import result_comments
 from gsmerge.io.formats.table import Contents
 from gsmerge.io.formats.write import format_notes
 from gsmerge.io.locks import lock_file
+from gsmerge.jobs.content_hash import content_hash, digest, list_files
 from gsmerge.jobs.states.compactor import extend_state
 from gsmerge.jobs.states.extend import BATCH
 from gsmerge.jobs.states.features import decode_features
 from gsmerge.jobs.states.state_file import State, load_state, save_state
-from gsmerge.reading.content_hash import content_hash, digest, doubt_changed, list_files
 from gsmerge.reading.exporters import NO_HINTS, ReadHints
+from gsmerge.reading.file_stats import doubt_changed
 from gsmerge.reading.input import read_input
 from gsmerge.reading.scene_files import SceneFiles, scene_title
 from gsmerge.results.outputs import Outputs, write_outputs

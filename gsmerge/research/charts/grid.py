@@ -11,7 +11,7 @@ from typing import Any
 
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.jobs.batch.find import find_scenes, main_file
-from gsmerge.reading.content_hash import content_hash, digest, fill_template, list_files, list_photos, scene_name
+from gsmerge.jobs.content_hash import content_hash, digest, fill_template, list_files, list_photos, scene_name
 from gsmerge.reading.scene_files import SceneFiles, find_scene_files
 from gsmerge.research.charts.lines import SIZE_SETTINGS
 from gsmerge.research.charts.measure_run import ChartScene, RunRecord, describe_run

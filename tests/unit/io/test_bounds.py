@@ -15,7 +15,7 @@ from gsmerge.errors import SceneError
 from gsmerge.io import bounds
 from gsmerge.io.bounds import ReadBudget, check_file, check_image_size, parse_json, read_lines, read_text
 from gsmerge.io.image_names import list_images
-from gsmerge.reading.content_hash import content_hash
+from gsmerge.jobs.content_hash import content_hash
 
 
 def test_images_of_too_many_pixels_or_none_are_refused(tmp_path: Path) -> None:

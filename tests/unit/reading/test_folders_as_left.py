@@ -21,8 +21,8 @@ from gsmerge.cli import main
 from gsmerge.errors import SceneError
 from gsmerge.io import read_cameras, to_cameras, write_ply
 from gsmerge.jobs.batch.find import find_scenes, main_file
+from gsmerge.jobs.content_hash import content_hash, list_files
 from gsmerge.jobs.states.state_file import load_state
-from gsmerge.reading.content_hash import content_hash, list_files
 from gsmerge.reading.read_scene import load_scene, read_scene
 from gsmerge.reading.scene_files import find_scene_files
 from gsmerge.results.outputs import Outputs

@@ -1,4 +1,4 @@
-"""Hash the files that a scene is read from, detect changes of these files, and fill the names of scenes into paths."""
+"""Hash the files that a scene is read from, and fill the names of scenes into paths."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ import hashlib
 import json
 import os
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from gsmerge.errors import Doubt, SceneError, UsageError, attempt, count_words
+from gsmerge.errors import SceneError, UsageError, attempt
 from gsmerge.io import SCENE_SUFFIXES, read_cameras
-from gsmerge.io.bounds import read_errors, walk_files
+from gsmerge.io.bounds import read_errors
 from gsmerge.io.cameras.dataparser import DATAPARSER
 from gsmerge.io.cameras.foreign import INTRINSICS
 from gsmerge.io.cameras.programs import FRAMES_FILE
+from gsmerge.reading.file_stats import list_inner
 from gsmerge.reading.photos.scene_photos import find_photos
 from gsmerge.reading.scene_files import SceneFiles
 
@@ -32,45 +32,13 @@ def content_hash(files: Sequence[Path]) -> str:
     """Compute one SHA-256 over the names and contents of files, and of all files in folders."""
     state = hashlib.sha256()
     for root in files:
-        for path in _walk(root):
+        for path in list_inner(root):
             name = path.relative_to(root).as_posix() if root.is_dir() else path.name
             with read_errors(path), path.open("rb") as file:
                 state.update(os.fsencode(f"{len(name)}:{name}:{path.stat().st_size}:"))
                 while block := file.read(1 << 20):
                     state.update(block)
     return state.hexdigest()
-
-
-def _walk(root: Path) -> list[Path]:
-    """List all files in a folder, sorted; for a path of a file, list only this file."""
-    return sorted(path for path in walk_files(root) if path.is_file()) if root.is_dir() else [root]
-
-
-def read_stats(files: SceneFiles) -> dict[Path, tuple[int, ...]]:
-    """Return the state of each file of a scene, for :func:`list_changed`: size, time of the last change, and inode."""
-    roots = [root for scene in (files, *files.more) for root in scene.paths]
-    return {path: stat for root in roots for path in _walk(root) if (stat := _read_stat(path)) is not None}
-
-
-def list_changed(stats: Mapping[Path, tuple[int, ...]]) -> list[str]:
-    """List the files that have changed since their ``stats`` were read; deleted files are not listed."""
-    return [str(path) for path, stat in stats.items() if _read_stat(path) not in (None, stat)]
-
-
-def doubt_changed(stats: Mapping[Path, tuple[int, ...]]) -> list[str]:
-    """Return a list with a doubt about a result if files of the result's scene have changed since they were read."""
-    changed = list_changed(stats)
-    more = f" and {count_words(len(changed) - 1, 'other file')}" if len(changed) > 1 else ""
-    problem = "changed during the run; the result is of what was read before"
-    return [Doubt(f"{changed[0]}{more} {problem}")] if changed else []
-
-
-def _read_stat(path: Path) -> tuple[int, ...] | None:
-    """Return the size, time of the last change and inode of a file; None if the file cannot be accessed."""
-    with suppress(OSError):
-        stat = path.stat()
-        return stat.st_size, stat.st_mtime_ns, stat.st_ino
-    return None
 
 
 def list_files(files: SceneFiles) -> list[Path]:
