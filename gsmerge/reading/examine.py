@@ -6,7 +6,7 @@ Nothing here raises a SceneError, since an error is evidence, too.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 
 from gsmerge.errors import SceneError, attempt
 from gsmerge.frozen import dataclass, replace
@@ -33,7 +33,7 @@ from gsmerge.reading.photos.scene_photos import (
     name_by_photos,
     read_photos,
 )
-from gsmerge.reading.scene_files import result_cameras
+from gsmerge.reading.scene_files import SceneFiles, result_cameras
 
 Measure = Callable[[CameraFile, ScenePhotos], Evidence]
 MeasureBare = Callable[[CameraFile], Evidence]  # without photos, whatever lenses the cameras have
@@ -44,48 +44,13 @@ def examine(ply: GaussianFile, views: Views, hints: ReadHints) -> Evidence:
     camera_file, photos, files = views.camera_file, views.photos, views.files
     stored = None if camera_file is None else replace(camera_file, images=())
     start = Evidence(views.candidate, stored=stored, photo_place=views.place)
+    if views.error is not None:
+        return _with_error(start, views.error)
     if photos.by_names:
         files = replace(files, images=photos.folder)
-    way = views.candidate.way
-    notes_on_way = [f"the cameras in {files.cameras} are read {way}, since they fit the Gaussians so"] if way else []
-
-    def fail(error: SceneError) -> Evidence:
-        """Return the evidence of an error, with what the cameras see if the error says so."""
-        return replace(start, error=error, sight=error.sight if isinstance(error, UnseenError) else None)
-
-    def make(cameras: CameraFile | None, shown: ScenePhotos) -> tuple[Loaded, CameraCheck | None]:
-        """Make the scene with some of the photos; also return what the cameras see, if it was measured."""
-        if cameras is None:
-            placed = place_no_views(ply, files, hints)
-        else:
-            pictures = read_photos(shown, cameras) if shown.named else shown
-            placed = place_views(ply, files, hints, cameras, pictures)
-        return make_scene(ply, placed, hints), placed.result.sight
-
-    def measure(cameras: CameraFile | None, shown: ScenePhotos) -> Evidence:
-        """Return what the scene with some of the photos shows, or the error that prevents a scene."""
-        made = attempt(make, cameras, shown)
-        if isinstance(made, SceneError):
-            return fail(made)
-        load, sight = made
-        return replace(
-            start,
-            are_pixels=load.scene.has_own_pixels,
-            share_near=None if load.alignment is None else load.alignment.share_near,
-            sight=sight,
-            num_views=len(load.scene),
-            names=load.scene.names,
-            own_views=load.own_views,
-            has_photos=load.scene.images is not None,
-            num_shown=len(load.scene.photo_views),
-            notes=(*notes_on_way, *load.notes),
-            load=load,
-        )
-
-    if views.error is not None:
-        return fail(views.error)
     if camera_file is None:
-        return measure(None, NO_PHOTOS)
+        return _measure(start, ply, files, hints, None, NO_PHOTOS)
+    measure = partial(_measure, start, ply, files, hints)
     if views.photo_error is None and not photos.named:  # there are no photos, or they are in one file
         alone = measure(camera_file, photos)
         is_result = RESULT_COMMENT in ply.info.comments or result_cameras(files.ply)  # films beside a result show it
@@ -96,10 +61,55 @@ def examine(ply: GaussianFile, views: Views, hints: ReadHints) -> Evidence:
     found: Evidence | SceneError | None = views.photo_error
     if found is None:
         found = attempt(_examine_photos, measure, measure_bare, camera_file, photos)
-    shown = fail(found) if isinstance(found, SceneError) else found
+    shown = _with_error(start, found) if isinstance(found, SceneError) else found
     if blames_photos(shown, views):
         return replace(shown, error=explain_mismatch(photos, camera_file))
     return choose_photos(shown, measure_bare(camera_file), views) if needs_bare(shown, views) else shown
+
+
+def _with_error(start: Evidence, error: SceneError) -> Evidence:
+    """Return the evidence of an error, with what the cameras see if the error says so."""
+    return replace(start, error=error, sight=error.sight if isinstance(error, UnseenError) else None)
+
+
+def _measure(
+    start: Evidence,
+    ply: GaussianFile,
+    files: SceneFiles,
+    hints: ReadHints,
+    cameras: CameraFile | None,
+    photos: ScenePhotos,
+) -> Evidence:
+    """Add to the evidence what a scene with these cameras and photos shows, or the error that prevents a scene."""
+
+    def make() -> tuple[Loaded, CameraCheck | None]:
+        """Make the scene; also return what the cameras see, if it was measured."""
+        if cameras is None:
+            placed = place_no_views(ply, files, hints)
+        else:
+            pictures = read_photos(photos, cameras) if photos.named else photos
+            placed = place_views(ply, files, hints, cameras, pictures)
+        return make_scene(ply, placed, hints), placed.result.sight
+
+    made = attempt(make)
+    if isinstance(made, SceneError):
+        return _with_error(start, made)
+    load, sight = made
+    way = start.candidate.way
+    notes_on_way = [f"the cameras in {files.cameras} are read {way}, since they fit the Gaussians so"] if way else []
+    return replace(
+        start,
+        are_pixels=load.scene.has_own_pixels,
+        share_near=None if load.alignment is None else load.alignment.share_near,
+        sight=sight,
+        num_views=len(load.scene),
+        names=load.scene.names,
+        own_views=load.own_views,
+        has_photos=load.scene.images is not None,
+        num_shown=len(load.scene.photo_views),
+        notes=(*notes_on_way, *load.notes),
+        load=load,
+    )
 
 
 @dataclass(frozen=True, eq=False)
