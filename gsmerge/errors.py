@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from copy import copy
 from os import PathLike
-from typing import TYPE_CHECKING, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -58,6 +58,8 @@ class SceneError(GsmergeError):
         # NAME" in a message has the word "view" twice
         problem = " ".join(problem.split()).replace("view view ", "view ")
         self.path, self.problem, self.remedy = str(path), problem, remedy
+        # what was tried before a scene was refused, see :class:`gsmerge.reading.choice.Choice`
+        self.candidates: tuple[Any, ...] = ()
         super().__init__(f"{self.path}: {problem}" + (f"; {remedy}" if remedy else ""))
 
     def __reduce__(self) -> tuple[type[SceneError], tuple[str, str, str], dict[str, object]]:

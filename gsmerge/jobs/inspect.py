@@ -143,11 +143,8 @@ def _describe_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> d
         "coverage": [],
         "new_views": None if expected is None else asdict(expected),
     }
-    reading = find_views(ply, files, hints)
-    load = attempt(finish, reading)
-    candidates = reading.candidates if isinstance(load, SceneError) else load.candidates
-    facts["candidates"] = [asdict(choice) for choice in candidates]
-    del reading  # frees the photos as they are stored
+    load = attempt(finish, find_views(ply, files, hints))
+    facts["candidates"] = [asdict(choice) for choice in load.candidates]
     if isinstance(load, SceneError):
         camera_file = None if files.cameras is None else attempt(read_scene_cameras, ply, files)
         if isinstance(camera_file, CameraFile):
@@ -252,7 +249,7 @@ def inspection_lines(scene: Mapping[str, Any]) -> list[str]:
         f"scales     median {extent['scale_median']:.3g}, largest {extent['scale_max']:.3g} in a scene of"
         f" {extent['diagonal']:.3g}; {100 * extent['share_huge']:.3g} % above a tenth of it",
         f"cameras    {cameras}",
-        f"images     {scene['images'] or 'none found'}",
+        f"images     {_describe_images(scene)}",
         *_candidate_lines(scene["candidates"]),
         *_alignment_lines(scene),
         *_coverage_lines(scene),
@@ -269,6 +266,13 @@ def inspection_lines(scene: Mapping[str, Any]) -> list[str]:
         share = f"{100 * auto['share']:.3g} %, {auto['num_gaussians']:,} Gaussians"
         lines += [f"auto       --budget auto takes {share}: {auto['why']}"]
     return [line for line in lines if line] + note_lines(scene["notes"])
+
+
+def _describe_images(scene: Mapping[str, Any]) -> str:
+    """Describe where the photos are, and whether they are used."""
+    photos = [one["chosen"] for one in scene["candidates"] if one["kind"] == "photos"]
+    left_out = ", left out" if photos and not any(photos) else ""
+    return f"{scene['images']}{left_out}" if scene["images"] else "none found"
 
 
 def _candidate_lines(candidates: Sequence[Mapping[str, Any]]) -> list[str]:

@@ -12,7 +12,7 @@ from gsmerge.reading.scene_files import SceneFiles
 from gsmerge.settings.reading import NONE
 
 OPTIONS = {"cameras": "--cameras", "photos": "--images", "masks": "--masks"}  # the option that names files of a kind
-ROWS = "rows"  # in place of the path of cameras that are estimated from the rows
+ESTIMATED_CAMERAS = "estimated"  # in place of the path of cameras that are estimated from the rows
 
 
 @dataclass(frozen=True)
@@ -20,18 +20,23 @@ class Choice:
     """Whether cameras, photos or masks that may belong to a scene are used, and why."""
 
     kind: str  # "cameras", "photos" or "masks"
-    path: str  # relative to the scene's folder if they lie in it; for other places, words such as "rows"
+    path: str  # relative to the scene's folder if they lie in it; for what is no file, a word such as "estimated"
     chosen: bool
     reason: str  # in a few words, with the number that decided
-    option: str  # what a user types to take them; empty if no option does
+    option: str  # what a user types to take them; empty if that would be refused, or would change nothing
 
 
-def make_choice(files: SceneFiles, kind: str, place: Path | str, reason: str, *, chosen: bool) -> Choice:
-    """Make the choice about a ``place``: a path, or :data:`ROWS` or other words for what is no file of its own."""
+def make_choice(
+    files: SceneFiles, kind: str, place: Path | str, reason: str, *, chosen: bool, can_be_named: bool = True
+) -> Choice:
+    """Make the choice about a ``place``: a path, :data:`ESTIMATED_CAMERAS`, or words for what is no file of its own.
+
+    ``can_be_named``: an option that names the place takes it.
+    """
     root, option = files.root or files.ply.parent, ""
     path = place.relative_to(root) if isinstance(place, Path) and place.is_relative_to(root) else place
-    if isinstance(place, Path) or place == ROWS:
-        option = shlex.join([OPTIONS[kind], NONE if place == ROWS else str(place)])
+    if can_be_named and (isinstance(place, Path) or place == ESTIMATED_CAMERAS):
+        option = shlex.join([OPTIONS[kind], NONE if place == ESTIMATED_CAMERAS else str(place)])
     return Choice(kind, path.as_posix() if isinstance(path, Path) else path, chosen, reason, option)
 
 

@@ -12,9 +12,9 @@ from gsmerge.errors import Doubt, SceneError, list_doubts, split_notes
 from gsmerge.frozen import dataclass, replace
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.image_names import IMAGE_SUFFIXES
-from gsmerge.reading.alignment import ESTIMATED, CameraCheck
+from gsmerge.reading.alignment import ESTIMATED, CameraCheck, UnseenError
 from gsmerge.reading.candidates import Candidate, Views
-from gsmerge.reading.choice import ROWS, Choice, make_choice
+from gsmerge.reading.choice import ESTIMATED_CAMERAS, Choice, make_choice
 from gsmerge.reading.loaded import Loaded
 from gsmerge.reading.photos.scene_photos import MismatchError, describe_missing
 from gsmerge.reading.scene_files import SceneFiles
@@ -118,12 +118,14 @@ def find_best(tried: Sequence[Evidence]) -> Evidence:
 def explain_refusal(tried: Sequence[Evidence]) -> SceneError:
     """Return what spoke against the best candidate, if none is chosen, with what the user can do."""
     files, best = tried[0].files, find_best(tried)
-    cause = best.error or find_cause(tried)
+    cause, cameras = best.error or find_cause(tried), best.files.cameras
+    problem = cause.problem
+    if len(tried) > 1 and cameras is not None and cause.path != str(cameras):
+        num_files = sum(one.files.cameras is not None for one in tried)
+        rank = f", the best of {num_files} camera files" if num_files > 1 else ""
+        problem += f" (cameras: {cameras}{rank})"
     options = [f"--{name} {NONE}" for name in ("cameras", "images") if name in files.named and getattr(files, name)]
     read_alone = f"{' and '.join(options)} reads the Gaussians alone" if options else ""
-    problem, cameras = cause.problem, str(best.files.cameras or ROWS)
-    if len(tried) > 1 and cause.path != cameras:
-        problem += f" (with {cameras}, the best of {len(tried)} candidates for the cameras)"
     return SceneError(cause.path, problem, "; ".join(filter(None, (cause.remedy, read_alone))))
 
 
@@ -173,7 +175,11 @@ def give_reasons(
         one = evidence_on.get(candidate)
         if one is not None:
             is_chosen = chosen is not None and chosen.candidate is candidate and one.num_views > 0
-            choices.append(make_choice(files, "cameras", _name_cameras(one), _judge(one, chosen), chosen=is_chosen))
+            reason, can_be_named = _judge(one, chosen)
+            place = _name_cameras(one)
+            choices.append(
+                make_choice(files, "cameras", place, reason, chosen=is_chosen, can_be_named=can_be_named)
+            )  # fmt: skip
         elif candidate.files.cameras is not None and not candidate.way:
             reason = "not examined, since others fit"
             choices.append(make_choice(files, "cameras", candidate.files.cameras, reason, chosen=False))
@@ -183,50 +189,63 @@ def give_reasons(
     for kind, path in files.above:
         reason = "outside the scene's folder"
         choices.append(make_choice(files, {"images": "photos"}.get(kind, kind), path, reason, chosen=False))
-    best = chosen or find_best(tried)
+    return (*choices, *_judge_photos(chosen or find_best(tried), files))
+
+
+def _judge_photos(best: Evidence, files: SceneFiles) -> list[Choice]:
+    """Say whether the photos of a candidate for the cameras are used, and why."""
     if best.photo_place is None:
-        return tuple(choices)
-    reason = f"show {best.num_shown} of {best.num_views} views"
-    error = best.photo_error or best.error
-    if error is not None:
-        reason = "show none of the views" if isinstance(error, MismatchError) else error.problem
+        return []
+    reason, error = f"show {best.num_shown} of {best.num_views} views", best.photo_error or best.error
+    if isinstance(error, MismatchError):
+        reason = "show none of the views"
+    elif isinstance(error, UnseenError) and error.sight is not None:
+        colors = error.sight.color_words
+        reason = f"the Gaussians' {colors}" if colors else "no cameras fit that show which views they have"
+    elif error is not None:
+        reason = error.problem
     elif not best.has_photos:
         reason = "no cameras say which views they show"
-    choices.append(make_choice(files, "photos", best.photo_place, reason, chosen=best.has_photos))
-    if files.images not in (None, best.photo_place, best.files.cameras):
-        reason = "another folder has the names of more views"
-        choices.append(make_choice(files, "photos", files.images, reason, chosen=False))
-    return tuple(choices)
+    photos = make_choice(
+        files, "photos", best.photo_place, reason, chosen=best.has_photos, can_be_named=best.has_photos
+    )
+    if files.images in (None, best.photo_place, best.files.cameras):
+        return [photos]
+    reason = "another folder has the names of more views"
+    return [photos, make_choice(files, "photos", files.images, reason, chosen=False)]
 
 
 def _name_cameras(one: Evidence) -> Path | str:
     """Return the path of cameras, or words for cameras without a file of their own."""
     if one.stored is not None and one.files.cameras is None and one.stored.source != ESTIMATED:
         return f"in {one.files.ply.name}"
-    path = one.files.cameras or ROWS
+    path = one.files.cameras or ESTIMATED_CAMERAS
     return f"{Path(path).name} read {one.candidate.way}" if one.candidate.way else path
 
 
-def _judge(one: Evidence, chosen: Evidence | None) -> str:
-    """Say in a few words, with the number that decided, why cameras were chosen or left out."""
+def _judge(one: Evidence, chosen: Evidence | None) -> tuple[str, bool]:
+    """Say in a few words, with the number that decided, why cameras were chosen or left out.
+
+    Also return whether an option that names them would take them.
+    """
     if one.error is not None:
         if one.photo_place is not None and Path(one.error.path).is_relative_to(one.photo_place):
-            return "the photos that were named do not show their views"
-        return one.error.problem if one.sight is None else one.sight.words
+            return "the photos that were named do not show their views", False
+        return one.error.problem if one.sight is None else one.sight.words, False
     if one.num_views == 0:
-        return "form no grid of pixels"
+        return "the Gaussians form no grid of pixels", False
     fact = "photos have the colours of the Gaussians in their views"
     if one.share_near is not None:
         fact = f"{100 * one.share_near:.1f} % of the Gaussians lie near their pixels"
     elif one.sight is not None:
         fact = f"see {100 * one.sight.share_seen:.0f} % of the Gaussians"
     if one.stored is not None and one.stored.source == ESTIMATED:
-        fact = f"form {one.num_views} views: {fact}"
-    if chosen is None or one.candidate is chosen.candidate:
-        return fact
-    if chosen.candidate.replaces_files and one.stored is not None:
-        return f"{fact}, but they are those of {len(one.stored)} of {chosen.num_views} views"
-    return f"{fact}, but no photo shows that they fit"
+        fact = f"the Gaussians form {one.num_views} views: {fact}"
+    if chosen is not None and one.candidate is not chosen.candidate and chosen.candidate.replaces_files:
+        return f"{fact}, but they are {one.num_views}, and the Gaussians form {chosen.num_views} views", False
+    is_shown = one.photo_error is None and (one.are_pixels or one.has_photos or one.photo_place is None)
+    is_chosen = chosen is None or one.candidate is chosen.candidate
+    return fact if is_chosen and is_shown else f"{fact}, but no photo shows that they fit", True
 
 
 def leave_out(evidence: Evidence, files: SceneFiles, left_out: Sequence[str], cause: SceneError) -> Evidence:

@@ -149,33 +149,38 @@ def add_larger_and_masks(load: Loaded) -> Loaded:
     is_plain = "masks" in files.named and files.masks is None  # the user wants no masks
     listed = "masks" not in files.named and any(source.camera_file.masks.values())
     place = f"listed in {Path(source.camera_file.path).name}" if listed else files.masks
-    mask_options = [name for name in ("masks", "protect") if getattr(files, name) is not None]
     refusal = ""
-    if mask_options and not source.size:
+    if source.size is None:
         refusal = "there are no photos"
-        text = f"the pictures of --{' and --'.join(mask_options)} are not used, since {refusal}"
-        notes.append(Doubt(text) if files.named.intersection(mask_options) else text)
+        if mask_options := [name for name in ("masks", "protect") if getattr(files, name) is not None]:
+            text = f"the pictures of --{' and --'.join(mask_options)} are not used, since {refusal}"
+            notes.append(Doubt(text) if files.named.intersection(mask_options) else text)
     read = attempt(read_larger_and_masks, files, source, scene.cameras, is_plain=is_plain)
     if isinstance(read, SceneError):
+        refusal = read.problem if read.path == str(place) else f"{Path(read.path).name}: {read.problem}"
         is_protecting = files.protect is not None and Path(read.path).is_relative_to(files.protect)
         is_listed = isinstance(read, CameraMaskError) or Path(read.path) in source.photos.paths
         if "masks" in files.named or is_protecting or is_listed:
-            raise read
-        refusal = read.problem
+            raise _with_choice(read, load, place, refusal)
         remedy = read.remedy or f"pass --masks FOLDER, or --masks {NONE}"
-        notes.append(Doubt(f"masks are left out: {read.path}: {refusal}; {remedy}"))
+        notes.append(Doubt(f"masks are left out: {read.path}: {read.problem}; {remedy}"))
         without_masks = replace(files, masks=None, named=files.named | {"masks"})
         read = read_larger_and_masks(without_masks, source, scene.cameras)
     large, masks, mask_notes = read
-    place = "transparency" if place is None and masks.counts is not None else place
-    masks, reason, check_notes = check_masks(masks, files, scene)
+    if place is None and masks.counts is not None:
+        place = "transparency"
+    checked = attempt(check_masks, masks, files, scene)
+    if isinstance(checked, SceneError):
+        raise _with_choice(checked, load, place, checked.problem)
+    masks, reason, check_notes = checked
     choices = [*load.candidates]
     if place is not None:
-        is_used = not refusal and masks is not NO_MASKS
-        choices.append(make_choice(files, "masks", place, refusal or reason, chosen=is_used))
+        have_names = masks.num_files > 0 or place == "transparency" or masks is NO_MASKS
+        reason = refusal or (reason if have_names else "have the name of no photo")
+        is_chosen = not refusal and have_names and masks is not NO_MASKS
+        choices.append(make_choice(files, "masks", place, reason, chosen=is_chosen, can_be_named=not refusal))
     if listed and files.masks is not None:
-        reason = "the camera file names others"
-        choices.append(make_choice(files, "masks", files.masks, reason, chosen=False))
+        choices.append(make_choice(files, "masks", files.masks, "the camera file names others", chosen=False))
     counts = masks.counts
     if scene.masks is not None:  # some views have no photo, and none of their pixels count
         counts = scene.masks if counts is None else counts & scene.masks
@@ -186,3 +191,12 @@ def add_larger_and_masks(load: Loaded) -> Loaded:
     scene = replace(scene, large_photos=large, masks=counts, importance=masks.importance, depths=depths)
     notes = [*load.notes, *notes, *mask_notes, *check_notes]
     return replace(load, scene=scene, source=None, notes=tuple(notes), candidates=tuple(choices))
+
+
+def _with_choice(error: SceneError, load: Loaded, place: Path | str | None, reason: str) -> SceneError:
+    """Return an error about masks with what was tried, the masks among it."""
+    error.candidates = load.candidates
+    if place is not None:
+        choice = make_choice(load.files, "masks", place, reason, chosen=False, can_be_named=False)
+        error.candidates += (choice,)
+    return error

@@ -207,6 +207,7 @@ def finish(reading: Reading) -> Loaded:
     Also raises SceneError for masks that cannot be used, see :func:`add_larger_and_masks`.
     """
     if isinstance(reading.outcome, SceneError):
+        reading.outcome.candidates = reading.candidates
         raise reading.outcome
     return add_larger_and_masks(replace(confirm_colors(reading.outcome), candidates=reading.candidates))
 

@@ -72,9 +72,14 @@ class CameraCheck:
     def words(self) -> str:
         """The measures in the words of a sentence about cameras."""
         seen = f"see {100 * self.share_seen:.0f} % of the Gaussians"
+        return f"{seen}, whose {self.color_words}" if self.color_words else seen
+
+    @property
+    def color_words(self) -> str:
+        """The measure of colours in words; empty if it is not known."""
         if np.isnan(self.color_ratio):
-            return seen
-        return f"{seen}, whose colours are {self.color_ratio:.2f} times as far from the photos as from random pixels"
+            return ""
+        return f"colours are {self.color_ratio:.2f} times as far from the photos as from random pixels"
 
 
 class UnseenError(SceneError):

@@ -48,6 +48,7 @@ class Masks:
 
     counts: np.ndarray | None = None  # [v,h,w] bool, True for a pixel that counts; None: all pixels count
     importance: np.ndarray | None = None  # [v,h,w] float32, weight of a pixel in a fit; None: all weights are 1
+    num_files: int = 0  # number of photos that have a file of a mask
 
 
 NO_MASKS = Masks()
@@ -180,7 +181,8 @@ def read_masks(
     _refuse_photos(error, place, "masks", masks, photos.pictures)
     _refuse_photos(SceneError, files.protect or "", "protect", protecting, photos.pictures)
     shape = cameras.height, cameras.width
-    result = Masks(_stack_views(counts, True, shape), _stack_views(importance, np.float32(1), shape))
+    num_files = sum(mask is not None for mask in masks)
+    result = Masks(_stack_views(counts, True, shape), _stack_views(importance, np.float32(1), shape), num_files)
     if files.protect is not None:
         notes.append(_describe_protected(result.importance, protecting))
     return result, notes

@@ -74,7 +74,11 @@ def test_candidates_that_see_nothing_or_cannot_be_read_are_left_out(tmp_path: Pa
     first, second, rows = inspect(tmp_path)["candidates"]
     assert names(first["reason"], "expected JSON")
     assert (second["path"], second["reason"]) == ("sparse/0", "see 0 % of the Gaussians")
-    assert (rows["path"], rows["chosen"], rows["reason"]) == ("rows", False, "form no grid of pixels")
+    assert (rows["path"], rows["chosen"], rows["reason"]) == (
+        "estimated",
+        False,
+        "the Gaussians form no grid of pixels",
+    )
 
 
 @pytest.mark.parametrize(
@@ -85,6 +89,36 @@ def test_masks_have_a_reason(tiny_folder: Path, tiny: Tiny, level: int, chosen: 
     write_images(tiny_folder / "masks", replace(tiny, images=np.full_like(tiny.images, level)))
     masks = inspect(tiny_folder)["candidates"][-1]
     assert (masks["kind"], masks["chosen"], masks["reason"]) == ("masks", chosen, reason)
+
+
+def test_masks_of_other_names_are_left_out(tiny_folder: Path, tiny: Tiny) -> None:
+    masks = replace(tiny, images=np.zeros_like(tiny.images), names=("x.png", "y.png", "z.png"))
+    write_images(tiny_folder / "masks", masks)
+    choice = inspect(tiny_folder)["candidates"][-1]
+    assert (choice["kind"], choice["chosen"], choice["reason"]) == ("masks", False, "have the name of no photo")
+
+
+def test_one_broken_mask_is_named(tiny_folder: Path, tiny: Tiny) -> None:
+    write_images(tiny_folder / "masks", tiny)
+    broken = sorted((tiny_folder / "masks").rglob("*.png"))[0]
+    broken.write_bytes(b"nothing")
+    found = inspect(tiny_folder)["candidates"][-1]
+    named = inspect(tiny_folder, masks=tiny_folder / "masks")
+    assert named["compact"] is None
+    for choice in (found, named["candidates"][-1]):
+        assert (choice["kind"], choice["chosen"], choice["option"]) == ("masks", False, "")
+        assert names(choice["reason"], broken.name)
+
+
+def test_cameras_whose_photos_are_left_out_are_uncertain(tmp_path: Path) -> None:
+    smooth = smooth_scene(48, 36)
+    save_export(tmp_path, smooth, export_rows(smooth, np.random.default_rng(0).permutation(3 * 36 * 48)[:2999]))
+    noise = np.random.default_rng(0).integers(0, 256, (2, *smooth.images.shape[1:]), np.uint8)
+    shutil.rmtree(tmp_path / "images")
+    write_images(tmp_path / "images", replace(smooth, images=noise, names=("x.png", "y.png")))
+    cameras, photos = inspect(tmp_path)["candidates"]
+    assert cameras["reason"] == "see 100 % of the Gaussians, but no photo shows that they fit"
+    assert (photos["chosen"], photos["reason"], photos["option"]) == (False, "show none of the views", "")
 
 
 def test_a_refused_scene_has_candidates_too(tiny_folder: Path, tiny: Tiny, tmp_path: Path) -> None:

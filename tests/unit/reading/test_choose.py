@@ -236,7 +236,7 @@ def test_a_refusal_says_what_reads_the_gaussians_alone() -> None:
 def test_a_refusal_is_about_the_cameras_that_see_most() -> None:
     little = SceneError(FILES.ply, "they see 3 %")
     error = explain_refusal([fails(sight=SEES_LITTLE), fails(CAMERAS[1], little, sight=SEES_HALF)])
-    assert error.problem == f"{little.problem} (with {SECOND}, the best of 2 candidates for the cameras)"
+    assert error.problem == f"{little.problem} (cameras: {SECOND}, the best of 2 camera files)"
     unmeasured = explain_refusal([fails(), fails(CAMERAS[1], little)])
     assert (unmeasured.path, unmeasured.problem) == (DAMAGED.path, DAMAGED.problem)  # the path names the candidate
 
@@ -253,9 +253,9 @@ def test_every_candidate_has_a_reason_and_an_option() -> None:
         ("cameras", "sparse/0", True, "99.8 % of the Gaussians lie near their pixels"),
         ("photos", "images", True, "show 2 of 3 views"),
     ]
-    assert [one.option for one in choices] == [f"--cameras {FIRST}", f"--cameras {SECOND}", f"--images {IMAGES}"]
+    assert [one.option for one in choices] == ["", f"--cameras {SECOND}", f"--images {IMAGES}"]
     assert candidate_lines([asdict(one) for one in choices]) == [
-        "cameras  transforms.json  left out  see 3 % of the Gaussians (--cameras scene/transforms.json)",
+        "cameras  transforms.json  left out  see 3 % of the Gaussians",
         "cameras  sparse/0         chosen    99.8 % of the Gaussians lie near their pixels",
         "photos   images           chosen    show 2 of 3 views",
     ]
@@ -272,11 +272,11 @@ def test_every_candidate_has_a_reason_and_an_option() -> None:
          [(False, "see 50 % of the Gaussians, but no photo shows that they fit"),
           (True, "100.0 % of the Gaussians lie near their pixels")]),
         ([fits(own_views=4, sight=SEES_HALF), fits(ROWS, num_views=4, share_near=1.0, stored=ESTIMATED_CAMERAS)], 1,
-         [(False, "see 50 % of the Gaussians, but they are those of 3 of 4 views"),
+         [(False, "see 50 % of the Gaussians, but they are 3, and the Gaussians form 4 views"),
           (False, "not examined, since others fit"),
-          (True, "form 4 views: 100.0 % of the Gaussians lie near their pixels")]),
+          (True, "the Gaussians form 4 views: 100.0 % of the Gaussians lie near their pixels")]),
         ([fails(), fails(CAMERAS[1]), Evidence(ROWS)], 2,
-         [(False, DAMAGED.problem), (False, DAMAGED.problem), (False, "form no grid of pixels")]),
+         [(False, DAMAGED.problem), (False, DAMAGED.problem), (False, "the Gaussians form no grid of pixels")]),
         ([fails(error=OTHER_PHOTOS, photo_place=IMAGES), fails(CAMERAS[1])], None,
          [(False, "the photos that were named do not show their views"), (False, DAMAGED.problem)]),
     ],
@@ -309,7 +309,7 @@ def test_files_that_are_not_searched_are_named_with_their_option() -> None:
     rows = Evidence(candidates[0])
     choices = give_reasons(candidates, [rows], rows)
     assert [(one.kind, one.option) for one in choices] == [
-        ("cameras", "--cameras none"), ("cameras", f"--cameras {a}"), ("cameras", f"--cameras {b}"),
+        ("cameras", ""), ("cameras", f"--cameras {a}"), ("cameras", f"--cameras {b}"),
         ("photos", "--images photos"),
     ]  # fmt: skip
     assert not any(one.chosen for one in choices)
