@@ -21,6 +21,7 @@ from gsmerge.settings.reading import NONE
 from gsmerge.settings.stages import Engine
 
 if TYPE_CHECKING:
+    from gsmerge.reading.choice import Choice
     from gsmerge.reading.read_scene import Loaded
     from gsmerge.reading.scene_files import SceneFiles
 
@@ -103,7 +104,11 @@ def compact(
         _decode_features(context, source, given, run)
     else:
         has_levels = "levels" in given.values
-        loaded = _compact_files(source, settings, writing, opt.read_hints(hint), run, has_levels=has_levels)
+        try:
+            loaded = _compact_files(source, settings, writing, opt.read_hints(hint), run, has_levels=has_levels)
+        except SceneError as error:
+            _print_candidates(error.candidates, run)
+            raise
     if run.has_page and not dry_run:
         _show_page(on_page, loaded, run, open=bool(open))
 
@@ -141,7 +146,7 @@ def _compact_files(
         from gsmerge.reading.input import read_input
 
         load = read_input(files, opacity=reading.opacity, hints=reading.hints)
-        _print_candidates(load, run)
+        _print_candidates(load.candidates, run)
         with opt.usage_errors():
             estimate = estimate_files(load, settings, outputs)
         print_document(estimate, dry_run_lines(estimate), as_json=run.json)
@@ -161,16 +166,16 @@ def _compact_files(
             files, settings, outputs, opacity=reading.opacity, hints=reading.hints, progress=progress,
             hashed=run.json, seconds_before=seconds_before, on_read=loads.append,
         )  # fmt: skip
-    _print_candidates(loads[0], run)
+    _print_candidates(loads[0].candidates, run)
     _print_result(document, run)
     return loads[0]
 
 
-def _print_candidates(load: "Loaded", run: Run) -> None:
+def _print_candidates(candidates: "Sequence[Choice]", run: Run) -> None:
     """With ``--verbose``, print which cameras, photos and masks were tried, and why they are used or left out."""
     from gsmerge.reading.choice import candidate_lines
 
-    for line in candidate_lines([asdict(choice) for choice in load.candidates]) if run.verbose else ():
+    for line in candidate_lines([asdict(choice) for choice in candidates]) if run.verbose else ():
         say(line, quiet=run.quiet)
 
 

@@ -71,6 +71,14 @@ def test_verbose_and_the_report_say_why_files_are_used(smallest_copy: Path, run:
     assert used[1]["reason"] == "show 3 of 3 views"
     assert run(*words, "-v", "-q", code=0).err == ""
     assert "transforms.json" in run(*words, "-v", "--dry-run", code=0).err
+    (smallest_copy / "others").mkdir()
+    for name in ("x.png", "y.png"):
+        noise = np.random.default_rng(0).integers(0, 256, (16, 24, 3), np.uint8)
+        cv2.imwrite(str(smallest_copy / "others" / name), noise)
+    err = run(*words, "-v", "--images", smallest_copy / "others", code=3).err
+    shown, _, refusal = err.partition("\ngsmerge: error:")
+    assert re.match(r"cameras +transforms.json +left out", shown)  # a refusal shows what was tried, too
+    assert refusal
 
 
 def test_a_scene_too_large_for_the_machine_is_noted_before_it_is_read(
