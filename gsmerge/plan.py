@@ -18,7 +18,7 @@ from gsmerge.fit import photo_scale, start_share
 from gsmerge.frozen import dataclass, replace
 from gsmerge.geometry.views import REPORT_VIEWS, pick_views, scored_views
 from gsmerge.prepare.confirm_depths import FEWEST, Agreement
-from gsmerge.prepare.prepare_scene import Prepared
+from gsmerge.prepare.prepared import Prepared
 from gsmerge.prepare.row_colors import RENDERS
 from gsmerge.prepare.scene_size import SceneSize
 from gsmerge.raster.photos import scored_tiles

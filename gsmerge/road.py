@@ -23,7 +23,8 @@ from gsmerge.io.formats.write import format_notes
 from gsmerge.pipeline import build
 from gsmerge.plan import Plan, choose_blocks, is_without_views, make_plan, note_ignored, run_parts
 from gsmerge.prepare.crop import crop_scene
-from gsmerge.prepare.prepare_scene import Prepared, prepare
+from gsmerge.prepare.prepare_scene import prepare
+from gsmerge.prepare.prepared import Prepared
 from gsmerge.prepare.row_colors import RENDERS
 from gsmerge.prepare.scene_size import measure_size
 from gsmerge.reading.exporters import NO_HINTS, ReadHints

@@ -27,7 +27,8 @@ from gsmerge.plan import (
 )
 from gsmerge.prepare.confirm_depths import confirm_depths
 from gsmerge.prepare.crop import crop_scene
-from gsmerge.prepare.prepare_scene import views_notes, without_repeats
+from gsmerge.prepare.prepare_scene import views_notes
+from gsmerge.prepare.repeats import without_repeats
 from gsmerge.prepare.scene_size import measure_size
 from gsmerge.reading.read_scene import Loaded
 from gsmerge.results.outputs import Outputs

@@ -22,7 +22,8 @@ from gsmerge.plan import describe_share
 from gsmerge.prepare.compare_photos import compare_photos
 from gsmerge.prepare.confirm_depths import confirm_depths
 from gsmerge.prepare.place_cameras import add_views
-from gsmerge.prepare.prepare_scene import views_notes, without_repeats
+from gsmerge.prepare.prepare_scene import views_notes
+from gsmerge.prepare.repeats import without_repeats
 from gsmerge.prepare.scene_size import unlike_captures
 from gsmerge.prepare.support import count_views_in_world
 from gsmerge.prepare.true_pixels import raise_sizes, with_pixels

@@ -7,7 +7,7 @@ from gsmerge.frozen import dataclass, replace
 from gsmerge.geometry.frame import scene_depth
 from gsmerge.io.cameras.camera_file import describe_moves, list_moves
 from gsmerge.plan import Plan, own_views
-from gsmerge.prepare.prepare_scene import Prepared
+from gsmerge.prepare.prepared import Prepared
 from gsmerge.prepare.row_colors import RENDERS
 from gsmerge.results.scores import compares_all_pixels, measure_renders, measure_result, round_for_output
 from gsmerge.runtime.record import Record, current_record, note, record_choices, record_part, stage

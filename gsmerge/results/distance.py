@@ -14,7 +14,7 @@ from gsmerge.fit.outside import outside_cameras, sample_gaussians
 from gsmerge.geometry.views import even_views, resize_cameras
 from gsmerge.kernels.pictures import blur
 from gsmerge.prepare.place_cameras import OUTSIDE_HIGH, OUTSIDE_LOW, between_cameras
-from gsmerge.prepare.prepare_scene import Prepared
+from gsmerge.prepare.prepared import Prepared
 from gsmerge.raster import render
 from gsmerge.raster.metrics import decibels
 from gsmerge.raster.photos import shrink_pictures

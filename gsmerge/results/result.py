@@ -16,7 +16,7 @@ from gsmerge.frozen import dataclass, field, replace
 from gsmerge.io.formats.rows import result_comments
 from gsmerge.io.formats.table import Contents
 from gsmerge.plan import Plan, own_views
-from gsmerge.prepare.prepare_scene import Prepared
+from gsmerge.prepare.prepared import Prepared
 from gsmerge.prepare.row_colors import OWN_PHOTOS, PHOTOS, RENDERS
 from gsmerge.raster.metrics import SAMPLE_LOSS, describe_distance, describe_loss, is_worse
 from gsmerge.results.candidate import Candidate, rescore, with_moved_views

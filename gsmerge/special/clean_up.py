@@ -8,7 +8,7 @@ from dataclasses import replace
 from gsmerge.fit import Fitted
 from gsmerge.pipeline import build
 from gsmerge.plan import Plan
-from gsmerge.prepare.prepare_scene import Prepared
+from gsmerge.prepare.prepared import Prepared
 from gsmerge.results.candidate import Candidate, score
 from gsmerge.runtime.record import Record, add_seconds, adopt, begin_part, note, record_choices, record_part
 from gsmerge.stages.clean import clean, describe_counts, faintest_dropped

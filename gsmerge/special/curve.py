@@ -18,7 +18,7 @@ from gsmerge.frozen import dataclass, replace
 from gsmerge.kernels.elementary import log, power
 from gsmerge.pipeline import build
 from gsmerge.plan import Plan
-from gsmerge.prepare.prepare_scene import Prepared
+from gsmerge.prepare.prepared import Prepared
 from gsmerge.raster.metrics import WINDOW, ssim
 from gsmerge.raster.photos import Photos, render_photos, scene_photos
 from gsmerge.runtime.record import begin_part, record_part, report_progress

@@ -10,7 +10,7 @@ import numpy as np
 from gsmerge.frozen import dataclass, replace
 from gsmerge.geometry.views import pick_views, subset
 from gsmerge.plan import Plan, make_plan
-from gsmerge.prepare.prepare_scene import Prepared, Reference
+from gsmerge.prepare.prepared import Prepared, Reference
 from gsmerge.prepare.row_colors import PHOTOS
 from gsmerge.raster.photos import NEAR_PLANE, Photos, scene_photos, score_photos
 from gsmerge.scoring.visibility import context_points, visible_pixels

@@ -18,7 +18,7 @@ from gsmerge.geometry.views import subset
 from gsmerge.kernels.elementary import power
 from gsmerge.pipeline import build
 from gsmerge.plan import Plan
-from gsmerge.prepare.prepare_scene import Prepared
+from gsmerge.prepare.prepared import Prepared
 from gsmerge.raster.photos import shrink_pictures
 from gsmerge.results.report import CompactReport, NewViews, compared_psnr
 from gsmerge.runtime.record import begin_part, record_part

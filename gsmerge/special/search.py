@@ -9,7 +9,7 @@ from typing import Any
 from gsmerge.kernels.elementary import exp, log, power
 from gsmerge.pipeline import build
 from gsmerge.plan import FIDELITY_LOSS, STAGE_STEPS, Plan, run_parts
-from gsmerge.prepare.prepare_scene import LEAST_VIEWS, Prepared
+from gsmerge.prepare.prepared import LEAST_VIEWS, Prepared
 from gsmerge.prepare.row_colors import PHOTOS, RENDERS
 from gsmerge.results.candidate import Candidate, score
 from gsmerge.results.scores import compares_all_pixels, may_leave_gaps, measure_input, measure_renders

@@ -28,7 +28,7 @@ from gsmerge.networks.checkpoint import IN_PACKAGE, load_checkpoint
 from gsmerge.networks.options import RESIDUAL, SLOTS
 from gsmerge.prepare import confirm_depths, exposure, scene_size
 from gsmerge.prepare import fill_holes as holes
-from gsmerge.prepare.prepare_scene import LEAST_VIEWS
+from gsmerge.prepare.prepared import LEAST_VIEWS
 from gsmerge.raster import metrics, photos, tiled_view
 from gsmerge.reading.alignment import align_rows as rows_first
 from gsmerge.reading.alignment import score

@@ -10,7 +10,8 @@ from dataclasses import fields
 from pathlib import Path
 
 import gsmerge
-from gsmerge.prepare.prepare_scene import Prepared, PrepareOptions
+from gsmerge.prepare.prepared import Prepared
+from gsmerge.settings.stages import PrepareOptions
 
 PACKAGE = Path(gsmerge.__file__).parent
 STEPS = ("prepare", "stages", "fit")

@@ -15,7 +15,8 @@ from sweeps import sweep
 from gsmerge import Compactor, CompactResult, Gaussians, Scene, compact, render
 from gsmerge.geometry.transforms import rgb_to_sh0, sh0_to_rgb
 from gsmerge.kernels import elementary
-from gsmerge.prepare.prepare_scene import PrepareOptions, prepare
+from gsmerge.prepare.prepare_scene import prepare
+from gsmerge.settings.stages import PrepareOptions
 
 Photos = np.ndarray
 Change = Callable[[Photos], Photos]

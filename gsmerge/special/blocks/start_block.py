@@ -8,7 +8,8 @@ from gsmerge.frozen import dataclass, replace
 from gsmerge.geometry.frame import Frame
 from gsmerge.pipeline import merge_views
 from gsmerge.plan import Plan, make_plan
-from gsmerge.prepare.prepare_scene import Prepared, prepare
+from gsmerge.prepare.prepare_scene import prepare
+from gsmerge.prepare.prepared import Prepared
 from gsmerge.results.scores import measure_input
 from gsmerge.runtime.memory import free_pages, make_array
 from gsmerge.runtime.record import begin_part

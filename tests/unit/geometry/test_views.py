@@ -17,7 +17,7 @@ from gsmerge.geometry.views import (
     scored_views,
     subset,
 )
-from gsmerge.prepare.prepare_scene import distinct_views
+from gsmerge.prepare.repeats import distinct_views
 from gsmerge.types import Scene
 
 

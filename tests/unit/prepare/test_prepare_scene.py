@@ -14,7 +14,8 @@ from gsmerge import Gaussians, Scene, compact, render
 from gsmerge.fit import FitOptions, fit_photos, fit_scene
 from gsmerge.geometry.transforms import project
 from gsmerge.prepare.place_cameras import HELD_OUT
-from gsmerge.prepare.prepare_scene import Prepared, prepare
+from gsmerge.prepare.prepare_scene import prepare
+from gsmerge.prepare.prepared import Prepared
 from gsmerge.prepare.row_colors import PHOTOS, ROW_COLORS
 from gsmerge.raster.photos import MASKED_WEIGHT, scene_pictures
 from gsmerge.reading.photos.scene_photos import without_photo

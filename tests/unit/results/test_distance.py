@@ -17,7 +17,8 @@ from gsmerge import Gaussians, Scene, compact, pipeline, render
 from gsmerge.errors import TargetError
 from gsmerge.geometry.views import resize_cameras
 from gsmerge.prepare.place_cameras import between_cameras
-from gsmerge.prepare.prepare_scene import Prepared, prepare
+from gsmerge.prepare.prepare_scene import prepare
+from gsmerge.prepare.prepared import Prepared
 from gsmerge.raster.metrics import decibels
 from gsmerge.results.distance import (
     DISTANCE_BLUR,

@@ -11,7 +11,8 @@ import scenes
 from gsmerge import Gaussians, Scene, compact, render
 from gsmerge.geometry.views import subset
 from gsmerge.io.formats.rows import ExpectedScores, copied_comments, new_views_comment, read_expected_scores
-from gsmerge.prepare.prepare_scene import LEAST_VIEWS, prepare
+from gsmerge.prepare.prepare_scene import prepare
+from gsmerge.prepare.prepared import LEAST_VIEWS
 from gsmerge.results.report import NewViews
 from gsmerge.settings.stages import PrepareOptions
 from gsmerge.special.left_out import choose_left_out, leave_out, mark_seen, mean_seen

@@ -14,7 +14,7 @@ from messages import noted, refuses
 from gsmerge.fit import FitOptions, Fitted
 from gsmerge.kernels import elementary
 from gsmerge.plan import FIDELITY_LOSS, Plan
-from gsmerge.prepare.prepare_scene import Prepared
+from gsmerge.prepare.prepared import Prepared
 from gsmerge.prepare.row_colors import PHOTOS
 from gsmerge.results.candidate import Candidate
 from gsmerge.runtime.record import Record
