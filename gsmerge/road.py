@@ -27,6 +27,7 @@ from gsmerge.prepare.prepare_scene import prepare
 from gsmerge.prepare.prepared import Prepared
 from gsmerge.prepare.row_colors import RENDERS
 from gsmerge.prepare.scene_size import measure_size
+from gsmerge.prepare.steps import STEPS, without
 from gsmerge.reading.exporters import NO_HINTS, ReadHints
 from gsmerge.reading.file_stats import doubt_changed
 from gsmerge.reading.input import as_scene, read_input
@@ -191,7 +192,8 @@ def plan_run(scene: Scene, options: CompactOptions) -> tuple[Prepared, Plan]:
         prepared = method.prepare(scene.numpy(), options.prepare)
         return prepared, make_plan(prepared, options, run=method.run)
     note_ignored(scene, options)
-    prepared = prepare(scene.numpy(), options.prepare, pixels=not is_without_views(scene, options))
+    steps = without("pixels") if is_without_views(scene, options) else STEPS
+    prepared = prepare(scene.numpy(), options.prepare, steps=steps)
     return prepared, make_plan(prepared, options)
 
 

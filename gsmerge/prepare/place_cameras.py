@@ -59,10 +59,13 @@ NO_VIEWS = (
 def add_views(scene: Scene, *, shown: bool = False, placed: str = NO_VIEWS) -> Scene:
     """Keep the finite Gaussians, and place cameras in a scene without cameras; notes say what was left out or placed.
 
-    The cameras are placed for a fit, or with ``shown`` for people who look at the scene (:func:`place_viewpoints`).
-    ``placed`` is the note about cameras that are not placed at a viewer's place. Raises ValueError if no Gaussian is
-    finite.
+    The arguments are those of :func:`place_views`. Raises ValueError if no Gaussian is finite.
     """
+    return place_views(keep_finite(scene), shown=shown, placed=placed)
+
+
+def keep_finite(scene: Scene) -> Scene:
+    """Keep the finite Gaussians, with a note on the others; ValueError if no Gaussian is finite."""
     g = scene.gaussians
     finite = np.ones(len(g), bool)
     for array in vars(g).values():
@@ -72,17 +75,26 @@ def add_views(scene: Scene, *, shown: bool = False, placed: str = NO_VIEWS) -> S
     count = int((~finite).sum())
     if count == len(g):
         raise ValueError("expected at least one finite Gaussian, got none")
-    if count:
-        note(f"{count} Gaussians are not finite and were left out")
-        scene = take_rows(scene, np.flatnonzero(finite))
-    if len(scene) == 0:
-        inside = place_inside(scene.gaussians)
-        note(placed if inside is None else VIEWER_VIEWS)
-        cameras = inside or (_place_around_and_inside if shown else place_around)(scene.gaussians)
-        order = sorted(range(len(cameras)), key=lambda view: (view + 1) % HELD_OUT != 0)  # held-out cameras come first
-        cameras = replace(cameras if shown else cameras[order], antialiased=scene.cameras.antialiased)
-        scene = _with_cameras(scene.gaussians, cameras)
-    return scene
+    if not count:
+        return scene
+    note(f"{count} Gaussians are not finite and were left out")
+    return take_rows(scene, np.flatnonzero(finite))
+
+
+def place_views(scene: Scene, *, shown: bool = False, placed: str = NO_VIEWS) -> Scene:
+    """Place cameras in a scene without cameras, with a note.
+
+    The cameras are placed for a fit, or with ``shown`` for people who look at the scene (:func:`place_viewpoints`).
+    ``placed`` is the note about cameras that are not placed at a viewer's place.
+    """
+    if len(scene):
+        return scene
+    inside = place_inside(scene.gaussians)
+    note(placed if inside is None else VIEWER_VIEWS)
+    cameras = inside or (_place_around_and_inside if shown else place_around)(scene.gaussians)
+    order = sorted(range(len(cameras)), key=lambda view: (view + 1) % HELD_OUT != 0)  # held-out cameras come first
+    cameras = replace(cameras if shown else cameras[order], antialiased=scene.cameras.antialiased)
+    return _with_cameras(scene.gaussians, cameras)
 
 
 def _with_cameras(gaussians: Gaussians, cameras: Cameras) -> Scene:

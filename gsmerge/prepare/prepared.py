@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
+from typing import Any, cast
 
 import numpy as np
 
@@ -23,7 +24,7 @@ FLAT = 2 / 255  # a picture shows one flat colour if the range of its values is 
 class Reference:
     """Which pictures of a canonical scene a result is fitted to and scored on."""
 
-    name: str  # "photos", or the name of the pictures that replace them
+    name: str  # "photos", or the name of the pictures that replace them; "" until they are chosen
     score_views: tuple[int, ...]  # Views whose pictures results are scored on
     # True if the scene has no views, so that all views are placed; no fit sees the views for scores
     placed: bool = False
@@ -38,7 +39,10 @@ class Reference:
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """A scene in its canonical frame, as the stages use it, with facts about it."""
+    """A scene in its canonical frame, as the stages use it, with facts about it.
+
+    The steps of :mod:`gsmerge.prepare.steps` make one of another. After the last step all facts are known.
+    """
 
     input_scene: Scene  # The scene as it was read, in its own world frame, with photos that look like its Gaussians
     # The canonical scene with pixels. It has every view once, and photos that do not show it are replaced
@@ -48,6 +52,15 @@ class Prepared:
     repeated: tuple[int, ...]  # Index in the canonical scene of every view of the input scene
     moved: bool  # True if views were moved to poses at which their photos agree, before a fit or by it
     agreement: Agreement | None = None  # Shares of depth that views confirm; None if views cannot be compared
+    changes: tuple[str, ...] = ()  # What was done to photos, cameras and Gaussians, a sentence for each step
+
+    def after(self, change: str, *, scene: Scene, **facts: Any) -> Prepared:
+        """Return a copy with another scene and other facts after a step; ``change`` says what it did, "" for nothing.
+
+        Until the pictures are chosen, a scene may have none.
+        """
+        changes = (*self.changes, change) if change else self.changes
+        return replace(self, scene=cast("PicturedScene", scene), changes=changes, **facts)
 
     @property
     def size(self) -> SceneSize:

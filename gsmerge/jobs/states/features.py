@@ -35,6 +35,7 @@ from gsmerge.networks.weights import NetworkWeights
 from gsmerge.pipeline import encode_groups
 from gsmerge.plan import make_plan
 from gsmerge.prepare.prepare_scene import prepare
+from gsmerge.prepare.steps import without
 from gsmerge.runtime.record import Progress, record_run, stage
 from gsmerge.runtime.threads import use_threads
 from gsmerge.settings.compact import ONE_PIECE, CompactOptions
@@ -139,7 +140,8 @@ def extend_features(
     _check_options(options)
     options = options.with_settings(ONE_PIECE)
     with use_threads(options.threads), record_run(progress) as record:
-        prepared = prepare(scene.numpy(), options.prepare, None if state is None else state.frame, outside=False)
+        frame = None if state is None else state.frame
+        prepared = prepare(scene.numpy(), options.prepare, frame, steps=without("outside"))  # other batches see more
         prepared_scene, world, checkpoint = prepared.scene, UNKNOWN_WORLD, None
         if state is not None:
             world = compare_worlds(feature_to_gaussians(state.refined), prepared_scene, prepared_scene.gaussians.means)

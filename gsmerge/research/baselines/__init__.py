@@ -7,13 +7,15 @@ from functools import partial
 from gsmerge.fit import FitOptions
 from gsmerge.io.formats.splat_transform import find_program
 from gsmerge.prepare.prepare_scene import prepare
+from gsmerge.prepare.steps import without
 from gsmerge.research.baselines import greedy, simple
 from gsmerge.settings.setting import flat_settings
 from gsmerge.special.methods import Method
 
 FULL_FIT_SETTINGS = ("effort", "poses", *(name for name in flat_settings(FitOptions) if name != "fit"))
 
-_baseline = partial(Method, prepare=partial(prepare, fill=False))  # uses only the Gaussians of the file
+_UNFILLED = without("holes", "scored views")  # baselines use only the Gaussians of the file
+_baseline = partial(Method, prepare=partial(prepare, steps=_UNFILLED))
 
 UNMERGED = _baseline("unmerged", simple.unmerged, uses=())
 UNMERGED_FIT = _baseline("unmerged-fit", simple.unmerged_fit, needs_photos=True, uses=FULL_FIT_SETTINGS)

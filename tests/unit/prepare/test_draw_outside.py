@@ -16,6 +16,7 @@ from gsmerge.geometry.frame import canonicalise
 from gsmerge.geometry.views import subset
 from gsmerge.prepare.draw_outside import draw_outside
 from gsmerge.prepare.prepare_scene import prepare
+from gsmerge.prepare.steps import without
 from gsmerge.prepare.true_pixels import with_pixels
 from gsmerge.types import SH_C0, LargePhotos, PicturedScene
 
@@ -112,7 +113,7 @@ def refuse(_: PicturedScene) -> PicturedScene:
 
 
 CALLS: dict[str, Callable[[Scene], object]] = {
-    "prepare": lambda room: prepare(seen_from(room, [0, 1]), outside=False),
+    "prepare": lambda room: prepare(seen_from(room, [0, 1]), steps=without("outside")),
     "blocks": lambda room: compact(room, blocks=2, superpixels="10%", fit="none"),
     "features": lambda room: Compactor(recipe="paper", superpixels="10%").extend(seen_from(room, [0, 1])),
 }
@@ -123,7 +124,7 @@ def test_nothing_is_drawn_for_parts_of_a_scene(
     room: Scene, monkeypatch: pytest.MonkeyPatch, call: Callable[[Scene], object]
 ) -> None:
     """Other views may see what theirs do not."""
-    monkeypatch.setattr("gsmerge.prepare.prepare_scene.draw_outside", refuse)
+    monkeypatch.setattr("gsmerge.prepare.steps.draw_outside", refuse)
     call(room)
 
 
@@ -136,7 +137,7 @@ def test_gaussians_that_no_view_sees_stay_in_a_result(room: Scene, monkeypatch: 
     result = compact_part()
     assert len(result.gaussians) == 300
     assert noted(result.report.notes, "no view sees 5 % of the Gaussians", "from 1 place beside")
-    monkeypatch.setattr("gsmerge.prepare.prepare_scene.draw_outside", lambda scene: scene)
+    monkeypatch.setattr("gsmerge.prepare.steps.draw_outside", lambda scene: scene)
     scores = [scenes.psnr_of(gaussians, away) for gaussians in (result.gaussians, compact_part().gaussians)]
     assert scores[0] > scores[1] + 4  # dB: without drawings a part is missing
     assert scores[0] > scenes.psnr_of(part.gaussians, away) - 3  # dB: a result of 300 Gaussians is coarser

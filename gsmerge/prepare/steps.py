@@ -1,0 +1,297 @@
+"""The steps that prepare a scene, in their order: each makes a prepared scene of another.
+
+A step that changes photos, cameras or Gaussians says so in :attr:`Prepared.changes`, in one sentence. A step that has
+nothing to do returns its argument. Code that needs only a part, such as the pixels, takes fewer steps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import cast
+
+import numpy as np
+
+from gsmerge.errors import count_words
+from gsmerge.frozen import dataclass, replace
+from gsmerge.geometry.frame import Frame, canonicalise
+from gsmerge.prepare.compare_photos import compare_photos
+from gsmerge.prepare.confirm_depths import confirm_depths
+from gsmerge.prepare.draw_left_out import draw_left_out, mask_background
+from gsmerge.prepare.draw_outside import draw_outside
+from gsmerge.prepare.exposure import equalise_exposure
+from gsmerge.prepare.fill_holes import fill_holes
+from gsmerge.prepare.move_poses import move_poses
+from gsmerge.prepare.place_cameras import HELD_OUT, draw_pictures, keep_finite, place_views
+from gsmerge.prepare.prepared import Prepared, Reference, with_photos
+from gsmerge.prepare.repeats import without_repeats
+from gsmerge.prepare.row_colors import PHOTOS, RENDERS, ROW_COLORS, add_row_colors
+from gsmerge.prepare.true_pixels import raise_sizes, with_pixels
+from gsmerge.raster.photos import counting_pixels
+from gsmerge.runtime.record import note, record_choices
+from gsmerge.settings.stages import PrepareOptions
+from gsmerge.types import PicturedScene, Scene
+
+WORLD = Frame(np.zeros(3), 1.0)  # the frame of a scene as it was read
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step of preparing a scene."""
+
+    name: str
+    take: Callable[[Prepared, PrepareOptions], Prepared]
+
+
+def begin(scene: Scene, frame: Frame | None = None) -> Prepared:
+    """Return a scene as it was read, before the first step.
+
+    ``frame`` is the canonical frame that the step "frame" enters; None stands for the scene's own frame.
+    """
+    return Prepared(
+        input_scene=replace(scene, depths=None),  # depth maps serve for holes alone
+        scene=cast("PicturedScene", scene),  # whose pictures are not chosen yet
+        frame=WORLD if frame is None else frame,
+        reference=Reference("", (), photo_files=scene.images),
+        repeated=tuple(range(len(scene))),
+        moved=False,
+    )
+
+
+def take_steps(steps: Sequence[Step], prepared: Prepared, options: PrepareOptions | None = None) -> Prepared:
+    """Take steps one after another; ``options`` None: the defaults."""
+    for step in steps:
+        prepared = step.take(prepared, options or PrepareOptions())
+    return prepared
+
+
+def select(*names: str) -> tuple[Step, ...]:
+    """Return the steps of these names, in their order."""
+    return tuple(step for step in STEPS if step.name in names)
+
+
+def without(*names: str) -> tuple[Step, ...]:
+    """Return all steps but those of these names."""
+    return tuple(step for step in STEPS if step.name not in names)
+
+
+def drop_repeats(p: Prepared, _: PrepareOptions) -> Prepared:
+    """Keep one of several views that are equal in every pixel, with a note."""
+    scene, repeated, notes = without_repeats(p.scene)
+    for text in notes:
+        note(text)
+    return p.after("".join(notes), scene=scene, repeated=tuple(repeated))
+
+
+def drop_nonfinite(p: Prepared, _: PrepareOptions) -> Prepared:
+    """Leave out Gaussians that are not finite, with a note."""
+    scene = keep_finite(p.scene)
+    count = len(p.scene.gaussians) - len(scene.gaussians)
+    return p.after(f"{count_words(count, 'Gaussian')} not finite: left out" if count else "", scene=scene)
+
+
+def place_missing_views(p: Prepared, _: PrepareOptions) -> Prepared:
+    """Place views in a scene that has none, with a note."""
+    if len(p.scene):
+        return p
+    scene = place_views(p.scene)
+    return p.after(f"no cameras: {len(scene)} views were placed", scene=scene, reference=Reference("", (), placed=True))
+
+
+def enter_frame(p: Prepared, _: PrepareOptions) -> Prepared:
+    """Move the scene into its canonical frame, or into the frame of all parts of a larger scene."""
+    scene, frame = canonicalise(p.scene, None if p.frame is WORLD else p.frame)
+    return p.after("", scene=scene, frame=frame)
+
+
+def raise_tiny_sizes(p: Prepared, _: PrepareOptions) -> Prepared:
+    """Raise the sizes of Gaussians that the low-pass hides, with a note."""
+    scene = raise_sizes(p.scene, placed=p.reference.placed)
+    change = "" if scene is p.scene else "Gaussians far smaller than a pixel got about half its size"
+    return p.after(change, scene=scene)
+
+
+def leave_out_background(p: Prepared, options: PrepareOptions) -> Prepared:
+    """Leave out the uniform background of photos of an object, before photos are compared.
+
+    Photos show nothing of the scene there.
+    """
+    if p.scene.images is None or options.extent == "photos" or options.look == "scene":
+        return p
+    scene = mask_background(PicturedScene.with_pictures(p.scene, p.scene.images, p.scene.masks))
+    count = _count_changed(p.scene.images, scene.images)
+    return p.after(f"{count_words(count, 'photo')}: the plain background is left out" if count else "", scene=scene)
+
+
+def use_photos(p: Prepared, options: PrepareOptions) -> Prepared:
+    """Use the photos, corrected, if they show the scene; photos that do not show it are replaced."""
+    if p.scene.images is None:
+        return p
+    pictured = PicturedScene.with_pictures(p.scene, p.scene.images, p.scene.masks)
+    scene, views = compare_photos(pictured, options.look)
+    if not views:
+        return p
+    count = _count_changed(pictured.images, scene.images)
+    change = f"{count_words(count, 'photo')} corrected, or covered where the Gaussians show something else"
+    reference = Reference(PHOTOS, views, photo_files=p.reference.photo_files)
+    return p.after(change if count else "", scene=scene, reference=reference)
+
+
+def use_row_colors(p: Prepared, _: PrepareOptions) -> Prepared:
+    """Use the colours of each view's own Gaussians if no photo shows the scene."""
+    if p.reference.name or not p.scene.has_own_pixels:
+        return p
+    has_photos = p.scene.images is not None
+    scene = add_row_colors(_without_photos(p), has_photos=has_photos)
+    change = f"photos do not show the Gaussians: {ROW_COLORS} are used in their place" if has_photos else ""
+    return p.after(change, scene=scene, reference=Reference(ROW_COLORS, tuple(range(len(scene)))))
+
+
+def use_renders(p: Prepared, _: PrepareOptions) -> Prepared:
+    """Use renders of the Gaussians if there is no other picture, with a note."""
+    if p.reference.name:
+        return p
+    has_photos, placed, every = p.scene.images is not None, p.reference.placed, tuple(range(len(p.scene)))
+    reason = "photos do not count" if has_photos else "no photos, and the rows are not the pixels of the views"
+    remedy = "" if has_photos else "; name photos with --images"
+    if not placed:  # if views were placed, another note has said this
+        note(f"{reason}: renders of the scene itself are used instead{remedy}")
+    drawn, scored = draw_pictures(_without_photos(p)), every[: len(every) // HELD_OUT] if placed else every
+    shown = tuple(view for view in scored if drawn.images[view].any())  # any result is right in an empty view
+    change = f"photos do not show the Gaussians: {RENDERS} are used in their place" if has_photos else ""
+    return p.after(change, scene=drawn, reference=Reference(RENDERS, shown or scored, placed))
+
+
+def give_input_pictures(p: Prepared, _: PrepareOptions) -> Prepared:
+    """Give the scene as it was read the pictures of its views, with which it is compared."""
+    if not p.reference.of_views:
+        return p
+    return replace(p, input_scene=with_photos(p.input_scene, p.scene, p.repeated))
+
+
+def equalise_exposures(p: Prepared, options: PrepareOptions) -> Prepared:
+    """Bring photos, and the Gaussians of their pixels, to one exposure if exposures differ at random."""
+    if not p.scene.has_own_pixels:
+        return p
+    scene = equalise_exposure(p.scene, p.reference.score_views, options.exposure)
+    change = "" if scene is p.scene else "photos, and the Gaussians of their pixels, brought to their mean exposure"
+    return p.after(change, scene=scene)
+
+
+def move_wrong_poses(p: Prepared, options: PrepareOptions) -> Prepared:
+    """Move cameras, with the Gaussians of their pixels, to where their photos agree, if poses are wrong."""
+    if not p.scene.has_own_pixels or options.poses == "fixed":
+        return p
+    scene = move_poses(p.scene, p.reference.score_views, always=options.poses == "free")
+    if scene is None:
+        return p
+    return p.after("cameras, and the Gaussians of their pixels, moved to where photos agree", scene=scene, moved=True)
+
+
+def keep_changed_files(p: Prepared, _: PrepareOptions) -> Prepared:
+    """Keep the photos as they were read if a step changed one that counts."""
+    files, reference = p.reference.photo_files, p.reference
+    if files is None or has_changed(files, p.scene, reference.score_views, p.repeated):
+        return p
+    return replace(p, reference=replace(reference, photo_files=None))
+
+
+def measure_agreement(p: Prepared, _: PrepareOptions) -> Prepared:
+    """Measure how much of the depth other views confirm, with a note if a result will be poor."""
+    agreement = confirm_depths(p.scene)
+    if agreement is None:
+        return p
+    record_choices(agreement=agreement.to_dict())
+    if agreement.advice:
+        note(agreement.advice)
+    return replace(p, agreement=agreement)
+
+
+def fill_scene(p: Prepared, options: PrepareOptions) -> Prepared:
+    """Fill holes with Gaussians, and draw what photos leave out."""
+    if not p.reference.of_views:
+        return p
+    views, masks = list(p.reference.score_views), p.scene.masks
+    shown = np.zeros(p.scene.images.shape[:3], bool)
+    has_row_colors = p.reference.name == ROW_COLORS  # these pictures have colours at all pixels
+    shown[views] = True if has_row_colors or masks is None else masks[views]
+    filled = fill_holes(p.scene, shown, everywhere=options.extent == "photos")
+    scene = draw_left_out(replace(filled, depths=None), masks)
+    count = len(scene.gaussians) - len(p.scene.gaussians)
+    changes = [f"{count_words(count, 'Gaussian')} added at pixels that no Gaussian covered"] if count else []
+    if _count_changed(p.scene.images, scene.images):
+        changes.append("pixels at which photos do not count show the Gaussians, or nothing")
+    return p.after("; ".join(changes), scene=scene)
+
+
+def score_shown_views(p: Prepared, _: PrepareOptions) -> Prepared:
+    """Score no view that counts nowhere any more, since holes were filled."""
+    scene, views = p.scene, p.reference.score_views
+    if not p.reference.of_views or scene.empty is None or scene.masks is None:
+        return p
+    seen = tuple(view for view in views if scene.masks[view].any())
+    return replace(p, reference=replace(p.reference, score_views=seen or views))
+
+
+def draw_unseen(p: Prepared, _: PrepareOptions) -> Prepared:
+    """Add pictures of Gaussians that no view sees, with a note, so that a fit keeps them."""
+    if p.scene.has_own_pixels or p.reference.placed:
+        return p
+    drawn, reference = draw_outside(p.scene), p.reference
+    if drawn is p.scene:
+        return p
+    change = f"{count_words(len(drawn) - len(p.scene), 'picture')} drawn of Gaussians that no view sees"
+    if reference.name == RENDERS:  # all pixels of all pictures are drawings
+        views = (*reference.score_views, *range(len(p.scene), len(drawn)))
+        drawn, reference = replace(drawn, masks=None), replace(reference, score_views=views)
+    return p.after(change, scene=drawn, reference=reference)
+
+
+STEPS: tuple[Step, ...] = (
+    Step("repeats", drop_repeats),
+    Step("finite", drop_nonfinite),
+    Step("views", place_missing_views),
+    Step("frame", enter_frame),
+    Step("pixels", lambda p, _: p.after("", scene=with_pixels(p.scene))),
+    Step("sizes", raise_tiny_sizes),
+    Step("background", leave_out_background),
+    Step("photos", use_photos),
+    Step("row colours", use_row_colors),
+    Step("renders", use_renders),
+    Step("input pictures", give_input_pictures),
+    Step("exposure", equalise_exposures),
+    Step("poses", move_wrong_poses),
+    Step("photo files", keep_changed_files),
+    Step("depths", measure_agreement),
+    Step("holes", fill_scene),
+    Step("scored views", score_shown_views),
+    Step("outside", draw_unseen),
+)
+
+
+def _without_photos(p: Prepared) -> Scene:
+    """Return the scene of views whose photos do not count, with the importance that its pixels had."""
+    importance = p.input_scene.importance
+    if importance is not None and not p.reference.placed:
+        importance = importance[[p.repeated.index(view) for view in range(len(p.scene))]]
+    bare = PicturedScene.without_pictures(p.scene)
+    return replace(bare, large_photos=None, masks=None, importance=importance)
+
+
+def _count_changed(before: np.ndarray, after: np.ndarray) -> int:
+    """Return how many of the pictures ``before [v,h,w,3]`` differ from ``after``; 0 if no new pictures were made."""
+    return 0 if before is after else sum(not np.array_equal(a, b) for a, b in zip(before, after, strict=True))
+
+
+def has_changed(photos: np.ndarray, scene: PicturedScene, views: Sequence[int], repeated: Sequence[int]) -> bool:
+    """Return whether preparation changed a pixel of the input's ``photos`` that counts in scores of ``views``.
+
+    ``repeated`` has the index in the ``scene`` of each photo's view.
+    """
+    if scene.images is photos:
+        return False
+    counting = counting_pixels(scene)
+    return any(
+        not np.array_equal(before[counting[view]], scene.images[view][counting[view]])
+        for before, view in zip(photos, repeated, strict=True)
+        if view in views
+    )

@@ -1,0 +1,41 @@
+"""Preparing a scene is a table of steps, each of which says what it did to photos, cameras and Gaussians."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scenes
+
+from gsmerge import Scene
+from gsmerge.geometry.views import subset
+from gsmerge.prepare.prepare_scene import prepare
+from gsmerge.prepare.steps import STEPS, select, without
+from gsmerge.types import NO_CAMERAS, make_scene
+
+
+@pytest.fixture(scope="module")
+def room() -> Scene:
+    return scenes.make_scene(scenes.room(), scenes.arc(3, 32, 24))
+
+
+def test_a_sound_scene_is_not_changed(room: Scene) -> None:
+    assert prepare(room).changes == ()
+
+
+def test_each_change_is_told_in_the_order_of_the_steps(room: Scene) -> None:
+    twice = subset(room, [0, 0, 1, 2])
+    broken = replace(twice.gaussians, opacities=np.where(np.arange(len(twice.gaussians)) == 5, np.nan, 0.9))
+    changes = prepare(replace(twice, gaussians=broken)).changes
+    assert changes[0] == "1 Gaussian not finite: left out"
+    assert prepare(twice).changes[0] == "1 view repeats another in every pixel and counts once"
+    assert prepare(make_scene(room.gaussians, NO_CAMERAS)).changes[0].startswith("no cameras: ")
+
+
+def test_fewer_steps_do_less(room: Scene) -> None:
+    bare = replace(room, pixels=None, images=None)
+    assert prepare(bare, steps=select("frame")).scene.pixels is None
+    assert prepare(bare, steps=select("pixels", "frame")).scene.pixels is not None
+    assert [step.name for step in select("photos", "frame")] == ["frame", "photos"]
+    assert len(without("holes")) == len(STEPS) - 1
