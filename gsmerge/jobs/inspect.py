@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from gsmerge.errors import Doubt, SceneError, attempt
-from gsmerge.geometry.frame import canonicalise
 from gsmerge.io import GaussianFile, file_notes, kept_comments
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.formats.gsm import list_batches
@@ -19,14 +18,12 @@ from gsmerge.io.formats.rows import read_expected_scores
 from gsmerge.io.photo_files import photo_array
 from gsmerge.jobs.estimate import estimate, estimate_lines
 from gsmerge.plan import describe_share
-from gsmerge.prepare.compare_photos import compare_photos
 from gsmerge.prepare.confirm_depths import confirm_depths
-from gsmerge.prepare.place_cameras import add_views
 from gsmerge.prepare.prepare_scene import views_notes
 from gsmerge.prepare.repeats import without_repeats
 from gsmerge.prepare.scene_size import unlike_captures
+from gsmerge.prepare.steps import begin, select, take_steps
 from gsmerge.prepare.support import count_views_in_world
-from gsmerge.prepare.true_pixels import raise_sizes, with_pixels
 from gsmerge.raster.photos import LEAST_OPACITY
 from gsmerge.reading.alignment import check_cameras
 from gsmerge.reading.candidates import read_scene_cameras
@@ -44,7 +41,7 @@ from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.settings.setting import join_words
 from gsmerge.stages.sky import sky_regions
-from gsmerge.types import PicturedScene, StrPath
+from gsmerge.types import StrPath
 
 _OWN = "gsmerge"  # exporter of files that gsmerge wrote
 _FILE_KEYS = (
@@ -171,19 +168,16 @@ def _describe_scene(load: Loaded, *, is_result: bool) -> dict[str, Any]:
     """
     scene = load.scene
     distinct = without_repeats(scene)[0]  # each view once, as in a run
-    # A run prepares the scene in the same way, with these sizes and these notes on sizes and photos
-    canonical, run_notes = distinct, list[str]()
-    if len(distinct.gaussians) > 0:
-        with record_part(silent=True) as record:
-            framed = canonicalise(add_views(distinct))[0]
-            canonical = raise_sizes(with_pixels(framed) if len(distinct) else framed, placed=len(distinct) == 0)
-            if canonical.images is not None:
-                compare_photos(PicturedScene.with_pictures(canonical, canonical.images, canonical.masks))
-        run_notes = record.notes
+    # A run takes these steps, too, with these sizes and these notes on sizes and photos
+    canonical, names = distinct, ("finite", "views", "frame", "sizes")
+    with record_part(silent=True) as record:
+        if len(distinct.gaussians) > 0:
+            steps = select(*names, "pixels", "photos") if len(distinct) else select(*names)
+            canonical = take_steps(steps, begin(distinct)).scene
     agreement, doubt = confirm_depths(canonical), unlike_captures(canonical.gaussians)
     doubts = doubt and Doubt(doubt), agreement.advice if agreement else None
     facts: dict[str, Any] = {
-        **note_entries(list(dict.fromkeys(filter(None, [*load.notes, *views_notes(scene), *run_notes, *doubts])))),
+        **note_entries(list(dict.fromkeys(filter(None, [*load.notes, *views_notes(scene), *record.notes, *doubts])))),
         "num_views": len(scene),
         "camera_format": load.cameras and load.cameras.source,
         "coverage": coverage(scene),
