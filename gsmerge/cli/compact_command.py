@@ -167,6 +167,8 @@ def _compact_files(
             hashed=run.json, seconds_before=seconds_before, on_read=loads.append,
         )  # fmt: skip
     _print_candidates(loads[0].candidates, run)
+    for change in document["choices"].get("changes", ()) if run.verbose else ():
+        say(f"changed  {change}", quiet=run.quiet)
     _print_result(document, run)
     return loads[0]
 

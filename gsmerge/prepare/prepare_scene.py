@@ -11,7 +11,7 @@ from gsmerge.prepare.prepared import Prepared
 from gsmerge.prepare.repeats import without_repeats
 from gsmerge.prepare.row_colors import NO_PHOTOS, PHOTOS, ROW_COLORS
 from gsmerge.prepare.steps import STEPS, Step, begin, has_changed, select, take_steps
-from gsmerge.runtime.record import record_part, stage
+from gsmerge.runtime.record import record_choices, record_part, stage
 from gsmerge.settings.stages import PrepareOptions
 from gsmerge.types import Scene
 
@@ -24,13 +24,16 @@ def prepare(
 
     Repeated views are dropped, and views are placed if there are none. Rows and photos are compared: photos that show
     the scene get its tones and its exposure, and views move to where they agree. Then holes are filled, and what no
-    view sees is drawn. :attr:`Prepared.changes` says what was done.
+    view sees is drawn. :attr:`Prepared.changes` says what was done, and so does the record of the run.
 
     ``frame`` is the canonical frame; None stands for the scene's own frame. Fewer ``steps`` are enough for a part of a
     larger scene, or if no stage needs pixels. Raises ValueError if there is no finite Gaussian, or if there are images
     without cameras.
     """
-    return take_steps(steps, begin(scene, frame), options)
+    prepared = take_steps(steps, begin(scene, frame), options)
+    if prepared.changes:
+        record_choices(changes=list(prepared.changes))
+    return prepared
 
 
 def views_notes(scene: Scene) -> list[str]:

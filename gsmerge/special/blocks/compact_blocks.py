@@ -202,14 +202,15 @@ def block_parts(views: int, steps: int, count: int) -> list[RunPart]:
 def adopt_records(outcomes: Iterable[tuple[T, Record]]) -> Iterator[tuple[T, dict[str, Any]]]:
     """Yield, for each block, what the block returned, and the choices in its record.
 
-    Seconds, notes and left-out photos in the block's record are added to the current record.
+    Seconds, notes, changes and left-out photos in the block's record are added to the current record.
     """
     for value, record in outcomes:
         add_seconds(record.seconds)
         for text in record.notes:
             note(text)
-        if left_out := record.choices.get("photos_left_out"):
-            record_choices(photos_left_out=[*current_record().choices.get("photos_left_out", ()), *left_out])
+        for name in ("changes", "photos_left_out"):
+            if of_block := record.choices.get(name):
+                record_choices(**{name: list(dict.fromkeys([*current_record().choices.get(name, ()), *of_block]))})
         yield value, record.choices
 
 

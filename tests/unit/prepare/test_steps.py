@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import scenes
 
-from gsmerge import Scene
+from gsmerge import Scene, compact
 from gsmerge.geometry.views import subset
 from gsmerge.prepare.prepare_scene import prepare
 from gsmerge.prepare.steps import STEPS, select, without
@@ -31,6 +31,13 @@ def test_each_change_is_told_in_the_order_of_the_steps(room: Scene) -> None:
     assert changes[0] == "1 Gaussian not finite: left out"
     assert prepare(twice).changes[0] == "1 view repeats another in every pixel and counts once"
     assert prepare(make_scene(room.gaussians, NO_CAMERAS)).changes[0].startswith("no cameras: ")
+
+
+def test_changes_are_in_the_report(room: Scene) -> None:
+    twice = subset(room, [0, 0, 1, 2])
+    report = compact(twice, effort="draft", budget=100).report
+    assert report.choices["changes"] == ["1 view repeats another in every pixel and counts once"]
+    assert "changes" not in compact(room, effort="draft", budget=100).report.choices
 
 
 def test_fewer_steps_do_less(room: Scene) -> None:
