@@ -41,7 +41,7 @@ LINE = 120  # most characters of a line of the page
 DIAGONAL = ([0, 1, 2], [0, 1, 2])  # indices of the diagonal of a matrix [3,3]
 WATCHED = {  # functions that are recorded, by the module that calls them
     "gsmerge.reading.make_scene": ("find_pixels",),
-    "gsmerge.road": ("make_plan", "build", "make_result"),
+    "gsmerge.run": ("make_plan", "build", "make_result"),
     "gsmerge.pipeline": ("segment_scene", "correct", "match", "merge", "decode_merged", "fit_scene"),
 }
 ZOOM, STRIP, GAP = 4, 22, 6  # enlargement of photos, height of a title, and gap between panels, pixels

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from gsmerge.reading.read_scene import read_scene as read_scene
     from gsmerge.results.report import CompactReport as CompactReport
     from gsmerge.results.result import CompactResult as CompactResult
-    from gsmerge.road import compact as compact
+    from gsmerge.run import compact as compact
     from gsmerge.scoring.evaluate import Evaluation as Evaluation
     from gsmerge.scoring.evaluate import evaluate as evaluate
     from gsmerge.settings.compact import CompactOptions as CompactOptions
@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     from gsmerge.types import Views as Views
 
 _PUBLIC = {
-    "road": ("compact",),
+    "run": ("compact",),
     "jobs.inspect": ("inspect",),
     "results.report": ("CompactReport",),
     "results.result": ("CompactResult",),

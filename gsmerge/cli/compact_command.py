@@ -157,7 +157,7 @@ def _compact_files(
     problem = memory_problem(memory_bytes(at_once, num_rest=num_rest, num_elsewhere=count - at_once))
     if problem is not None:
         say(problem, kind="warning", quiet=run.silent)
-    from gsmerge.road import compact_files
+    from gsmerge.run import compact_files
 
     loads: list[Loaded] = []
     seconds_before = {"import": perf_counter() - run.start}

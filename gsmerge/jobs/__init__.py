@@ -1,1 +1,1 @@
-"""What calls the road or serves beside it: convert, inspect, estimates, tensors, states, and batches of scenes."""
+"""What calls a run or serves beside it: convert, inspect, estimates, tensors, states, and batches of scenes."""

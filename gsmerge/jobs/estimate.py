@@ -32,7 +32,7 @@ from gsmerge.prepare.repeats import without_repeats
 from gsmerge.prepare.scene_size import measure_size
 from gsmerge.reading.read_scene import Loaded
 from gsmerge.results.outputs import Outputs
-from gsmerge.road import compact_scene
+from gsmerge.run import compact_scene
 from gsmerge.runtime.documents import document_head, note_entries, note_lines
 from gsmerge.runtime.memory import human_bytes, memory_bytes, memory_problem
 from gsmerge.runtime.record import record_part, record_run
@@ -200,7 +200,7 @@ def estimate_lines(run: Mapping[str, Any]) -> list[str]:
 
 
 def estimate_files(load: Loaded, settings: CompactOptions, outputs: Outputs) -> dict[str, Any]:
-    """Return the document of ``--dry-run``: what :func:`gsmerge.road.compact_files` would make."""
+    """Return the document of ``--dry-run``: what :func:`gsmerge.run.compact_files` would make."""
     scene, out = load.scene, outputs.result
     notes = [*load.notes, *views_notes(scene)]
     if os.path.lexists(out) and not outputs.overwrite:

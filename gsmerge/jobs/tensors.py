@@ -34,7 +34,7 @@ from gsmerge.reading.alignment import (
 )
 from gsmerge.reading.input import TOLERANCE, check_numbers, check_poses, check_values
 from gsmerge.results.result import CompactResult
-from gsmerge.road import compact
+from gsmerge.run import compact
 from gsmerge.runtime.record import Progress
 from gsmerge.types import NO_CAMERAS, Cameras, Gaussians, Pixels, Scene
 

@@ -20,7 +20,7 @@ from gsmerge.frozen import dataclass, replace
 from gsmerge.geometry.frame import Frame, scene_frame
 from gsmerge.geometry.transforms import move_views
 from gsmerge.geometry.views import even_views, subset, take_rows
-from gsmerge.road import compact
+from gsmerge.run import compact
 from gsmerge.runtime.record import Progress
 from gsmerge.scoring.evaluate import EvaluateOptions, evaluate
 from gsmerge.settings.budget import BudgetOptions

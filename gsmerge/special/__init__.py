@@ -1,1 +1,1 @@
-"""Runs that leave the road: searches, budgets in bytes, clean-up, blocks, new views, and methods of others."""
+"""Special runs: searches, budgets in bytes, clean-up, blocks, new views, and methods of others."""

@@ -60,7 +60,7 @@ class Broken:
 def test_failure_of_a_stage_is_one_line_with_its_exit_code(
     error: BaseException, code: int, line: str, smallest_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gsmerge.road.compact_scene", Broken(error))
+    monkeypatch.setattr("gsmerge.run.compact_scene", Broken(error))
     before = listing(smallest_copy)
     outcome = run("compact", smallest_copy, "--quiet")
     assert (outcome.code, outcome.err, outcome.out) == (code, f"{ERROR}{line}\n", "")
@@ -111,7 +111,7 @@ def test_a_missing_file_is_bad_input_in_every_command(words: str, smallest_copy:
 
 
 def test_debug_shows_the_traceback(smallest_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gsmerge.road.compact_scene", Broken(KeyError("lost")))
+    monkeypatch.setattr("gsmerge.run.compact_scene", Broken(KeyError("lost")))
     outcome = run("compact", smallest_copy, "--quiet", "--debug", code=1)
     assert outcome.err.startswith("Traceback (")
     assert "Traceback" not in run("compact", smallest_copy, "--quiet").err  # and is forgotten by the next call
@@ -214,7 +214,7 @@ def test_signal_ends_a_command_where_other_code_swallows_it(
         except KeyboardInterrupt as interrupt:
             raise error from interrupt
 
-    monkeypatch.setattr("gsmerge.road.compact_scene", compact)
+    monkeypatch.setattr("gsmerge.run.compact_scene", compact)
     outcome = run("compact", smallest_copy, code=code)
     assert outcome.err == f"{ERROR}{'interrupted' if code == 130 else f'ended by {name}'}\n"
     assert not (smallest_copy / "scene.compact.ply").exists()
@@ -225,7 +225,7 @@ def test_signal_ends_a_command_where_other_code_swallows_it(
 def test_ignored_signal_stays_ignored(smallest_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     """As under nohup."""
     seen = []
-    monkeypatch.setattr("gsmerge.road.compact_scene", lambda *_, **__: seen.append(signal.getsignal(signal.SIGHUP)))
+    monkeypatch.setattr("gsmerge.run.compact_scene", lambda *_, **__: seen.append(signal.getsignal(signal.SIGHUP)))
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         run("compact", smallest_copy, "--quiet")

@@ -19,7 +19,7 @@ from gsmerge.errors import SceneError
 from gsmerge.geometry.views import subset
 from gsmerge.reading.scene_files import find_scene_files
 from gsmerge.results.outputs import Outputs
-from gsmerge.road import compact_files
+from gsmerge.run import compact_files
 from gsmerge.runtime.documents import file_sha256
 from gsmerge.settings.compact import CompactOptions
 

@@ -82,7 +82,7 @@ def test_result_in_a_second_format_shares_the_cameras(smallest_copy: Path, run: 
     for change in ({"img_name": "other"}, {"fx": 1.0 + entries[0]["fx"]}, {"width": 1}):
         (out / "a.cameras.json").write_text(json.dumps([entries[0] | change, *entries[1:]]))
         with pytest.MonkeyPatch.context() as patch:  # before anything is compacted
-            patch.setattr("gsmerge.road.compact_scene", Mock(side_effect=AssertionError))
+            patch.setattr("gsmerge.run.compact_scene", Mock(side_effect=AssertionError))
             done = run("compact", smallest_copy, "-o", out / "a.sog", *QUICK, code=2)
         assert says(done.err.removeprefix(ERROR), "a.cameras.json", "cameras", "--overwrite")
     assert sorted(path.name for path in out.iterdir()) == ["a.cameras.json", "a.ply", "a.spz"]

@@ -215,7 +215,7 @@ def test_wrong_usage_is_refused_in_one_line_before_the_work(
 
     if words.startswith("lab train --data"):
         pytest.importorskip("torch", reason="torch is not installed")
-    for name in ("road.compact_scene", "drawing.pages.data.evaluate") if words not in NEED_THE_SCENE else ():
+    for name in ("run.compact_scene", "drawing.pages.data.evaluate") if words not in NEED_THE_SCENE else ():
         monkeypatch.setattr(f"gsmerge.{name}", work)
     monkeypatch.chdir(prepared)
     before = listing(prepared)

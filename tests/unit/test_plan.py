@@ -313,7 +313,7 @@ def test_the_estimate_is_what_the_run_does(
         plans.append(make_plan(*arguments, **run))
         return plans[-1]
 
-    monkeypatch.setattr("gsmerge.road.make_plan", record_plan)
+    monkeypatch.setattr("gsmerge.run.make_plan", record_plan)
     options = options_of(**settings)
     size, agreement = measure_size(scene), confirm_depths(canonicalise(scene)[0])
     run, result, choices = (

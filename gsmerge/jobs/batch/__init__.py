@@ -1,4 +1,4 @@
-"""Compact many scenes with :func:`gsmerge.road.compact_files`, on this machine or on a cluster."""
+"""Compact many scenes with :func:`gsmerge.run.compact_files`, on this machine or on a cluster."""
 
 from gsmerge.jobs.batch.jobs import BatchOptions, Job, find_jobs
 from gsmerge.jobs.batch.run import run_batch

@@ -18,7 +18,7 @@ from gsmerge.jobs.content_hash import content_hash, digest, fill_template, list_
 from gsmerge.networks.checkpoint import load_checkpoint
 from gsmerge.reading.scene_files import SceneFiles, find_scene_files
 from gsmerge.results.outputs import Outputs
-from gsmerge.road import compact_files
+from gsmerge.run import compact_files
 from gsmerge.runtime.documents import SCHEMA_VERSION, file_sha256
 from gsmerge.runtime.memory import memory_bytes
 from gsmerge.runtime.record import list_some

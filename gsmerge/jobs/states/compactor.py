@@ -13,7 +13,7 @@ from gsmerge.jobs.states.features import decode_features, extend_features
 from gsmerge.jobs.states.state_file import State, load_state, save_state
 from gsmerge.reading.input import as_scene
 from gsmerge.results.result import CompactResult
-from gsmerge.road import compact
+from gsmerge.run import compact
 from gsmerge.runtime.arguments import check_arguments
 from gsmerge.runtime.record import Progress
 from gsmerge.settings.extend import batch_settings

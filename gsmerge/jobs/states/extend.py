@@ -17,7 +17,7 @@ from gsmerge.prepare.prepared import Prepared
 from gsmerge.raster.photos import counting_pixels, shrink_pictures
 from gsmerge.reading.alignment import check_cameras
 from gsmerge.results.outputs import join_gaussians
-from gsmerge.road import compact_prepared, plan_run
+from gsmerge.run import compact_prepared, plan_run
 from gsmerge.runtime.record import Progress, record_run
 from gsmerge.runtime.threads import use_threads
 from gsmerge.scoring.sizes import resize_mask

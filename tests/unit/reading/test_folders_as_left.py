@@ -26,7 +26,7 @@ from gsmerge.jobs.states.state_file import load_state
 from gsmerge.reading.read_scene import load_scene, read_scene
 from gsmerge.reading.scene_files import find_scene_files
 from gsmerge.results.outputs import Outputs
-from gsmerge.road import compact_files
+from gsmerge.run import compact_files
 from gsmerge.settings.compact import CompactOptions
 
 SMOOTH = replace(smooth_scene(48, 36), names=tuple(f"input_{i:06d}.png" for i in (4, 17, 30)))

@@ -16,7 +16,7 @@ from gsmerge.io.formats.ply import file_bytes
 from gsmerge.jobs.file_checks import check_content
 from gsmerge.reading.scene_files import find_scene_files
 from gsmerge.results.outputs import Outputs
-from gsmerge.road import compact_files
+from gsmerge.run import compact_files
 from gsmerge.settings.compact import CompactOptions
 
 PLAIN = CompactOptions().with_settings({"superpixels": "20%", "fit": "none", "threads": 1})

@@ -1,4 +1,4 @@
-"""The road of a run: read -> prepare -> plan -> build -> score -> write.
+"""A run, from its first function to its last: read -> prepare -> plan -> build -> score -> write.
 
 :func:`compact_files` reads and writes, :func:`compact_scene` prepares and plans, and :func:`compact_prepared` builds
 and scores. A plain run goes through these functions from top to bottom. :func:`gsmerge.pipeline.build` calls the stages
