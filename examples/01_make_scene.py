@@ -17,7 +17,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from gsmerge.errors import GsmergeError
+from gsmerge import GsmergeError
 from gsmerge.research.generate import GenerateOptions, NoiseOptions, generate_scene
 
 # The scene is like a usual export: colours do not depend on the view, opacities vary, and lengths are in metres.

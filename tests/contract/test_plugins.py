@@ -14,9 +14,26 @@ from pathlib import Path
 
 import pytest
 
-from gsmerge import read_ply
+from gsmerge import plugin, read_ply
 
-PAGE = Path(__file__).parents[2] / "docs" / "internals" / "adding.md"
+ROOT = Path(__file__).parents[2]
+PAGE = ROOT / "docs" / "internals" / "adding.md"
+PUBLIC = {"gsmerge", "gsmerge.plugin", "gsmerge.integrations"}
+MAKER = {"gsmerge.research.generate"}  # what makes scenes to try, which examples may use
+
+
+def test_pages_and_examples_import_what_is_public() -> None:
+    """Others may change with any version."""
+    pages = [PAGE, *(ROOT / "docs" / "guide").glob("*.md"), *(ROOT / "examples").rglob("*.py")]
+    pages += (ROOT / "examples").rglob("*.ipynb")
+    for page in pages:
+        modules = set(re.findall(r"^[ \"]*(?:from|import) (gsmerge[\w.]*)", page.read_text("utf-8"), re.MULTILINE))
+        assert modules <= PUBLIC | MAKER, page.name
+
+
+def test_names_for_plugins_are_explained() -> None:
+    names = {name for name in vars(plugin) if name[0] != "_" and name != "annotations"}
+    assert names <= set(re.findall(r"``(\w+)``", str(plugin.__doc__)))
 
 
 @pytest.fixture

@@ -6,11 +6,9 @@ from functools import partial
 
 from gsmerge.fit import FitOptions
 from gsmerge.io.formats.splat_transform import find_program
-from gsmerge.prepare.prepare_scene import prepare
-from gsmerge.prepare.steps import without
+from gsmerge.plugin import Method, prepare, without
 from gsmerge.research.baselines import greedy, simple
 from gsmerge.settings.setting import flat_settings
-from gsmerge.special.methods import Method
 
 FULL_FIT_SETTINGS = ("effort", "poses", *(name for name in flat_settings(FitOptions) if name != "fit"))
 

@@ -17,9 +17,7 @@ from numpy.typing import NDArray
 
 from gsmerge.geometry.pooling import MAX_OPACITY
 from gsmerge.kernels.elementary import log, power
-from gsmerge.plan import Plan
-from gsmerge.prepare.prepared import Prepared
-from gsmerge.runtime.record import stage
+from gsmerge.plugin import Plan, Prepared, stage
 from gsmerge.runtime.threads import parallel_map, use_threads
 from gsmerge.stages.pair_merge import FLATNESS, MIN_OPACITY, Cloud, cloud_of, gaussians_of_cloud, merge_rows
 from gsmerge.types import Gaussians

@@ -11,9 +11,7 @@ import numpy as np
 from gsmerge.fit import fit_scene
 from gsmerge.io import read_ply, write_ply
 from gsmerge.io.formats.splat_transform import run_program
-from gsmerge.plan import Plan
-from gsmerge.prepare.prepared import Prepared
-from gsmerge.runtime.record import stage
+from gsmerge.plugin import Plan, Prepared, stage
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.stages import DecodeOptions
 from gsmerge.stages.assign import assign
