@@ -10,7 +10,7 @@ from dataclasses import replace
 from gsmerge.fit import Fitted, fit_scene
 from gsmerge.geometry.pooling import Members
 from gsmerge.networks.corrector import ANALYTIC, Corrector
-from gsmerge.plan import Plan
+from gsmerge.plan.plan import Plan
 from gsmerge.prepare.prepared import Prepared
 from gsmerge.prepare.row_colors import RENDERS
 from gsmerge.runtime.record import record_choices

@@ -21,7 +21,10 @@ from gsmerge.io.formats.rows import result_comments
 from gsmerge.io.formats.table import Contents
 from gsmerge.io.formats.write import format_notes
 from gsmerge.pipeline import build
-from gsmerge.plan import Plan, choose_blocks, is_without_views, make_plan, note_ignored, run_parts
+from gsmerge.plan.blocks import choose_blocks
+from gsmerge.plan.forecast import run_parts
+from gsmerge.plan.make_plan import is_without_views, make_plan, note_ignored
+from gsmerge.plan.plan import Plan
 from gsmerge.prepare.crop import crop_scene
 from gsmerge.prepare.prepare_scene import prepare
 from gsmerge.prepare.prepared import Prepared

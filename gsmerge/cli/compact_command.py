@@ -123,7 +123,7 @@ def _compact_files(
     """
     from gsmerge.io.formats.table import estimate_counts
     from gsmerge.io.formats.write import level_output
-    from gsmerge.plan import wanted_blocks
+    from gsmerge.plan.blocks import wanted_blocks
     from gsmerge.results.outputs import name_outputs, settings_for
     from gsmerge.runtime.memory import memory_bytes, memory_problem
     from gsmerge.special.blocks.partition import gaussians_at_once

@@ -23,6 +23,7 @@ from gsmerge.io.formats.table import Contents, Format
 from gsmerge.io.formats.write import format_notes
 from gsmerge.io.photo_files import read_images
 from gsmerge.kernels.matrices import matmul
+from gsmerge.plan.counts import STREAMED_LEVELS, level_counts
 from gsmerge.prepare.place_cameras import place_viewpoints
 from gsmerge.reading.scene_files import find_scene_files, named_path, result_cameras, scene_title
 from gsmerge.results.outputs import NUM_FULL, Outputs, frame_notes, join_gaussians, pad_harmonics, write_outputs
@@ -34,7 +35,6 @@ from gsmerge.settings.files import AXES, PlacementOptions, parse_triple
 from gsmerge.settings.reading import NONE, ColorChoice, OpacityChoice, ScaleChoice
 from gsmerge.settings.stages import CleanOptions
 from gsmerge.stages.clean import clean, describe_counts
-from gsmerge.stages.counts import STREAMED_LEVELS, level_counts
 from gsmerge.stages.pair_merge import merge_neighbors
 from gsmerge.types import NO_CAMERAS, Cameras, Gaussians, StrPath, make_scene
 

@@ -13,18 +13,11 @@ from gsmerge.frozen import dataclass
 from gsmerge.geometry.frame import canonicalise
 from gsmerge.io.formats.ply import file_bytes
 from gsmerge.io.formats.table import find_format
-from gsmerge.plan import (
-    FIDELITY_LOSS,
-    FIDELITY_PSNR,
-    TRIAL_SHARE,
-    choose_blocks,
-    is_without_views,
-    load_networks,
-    note_ignored,
-    plan_scene,
-    resolve_budget,
-    usual_builds,
-)
+from gsmerge.plan.blocks import choose_blocks
+from gsmerge.plan.counts import FIDELITY_LOSS, FIDELITY_PSNR, level_counts, resolve_budget
+from gsmerge.plan.forecast import TRIAL_SHARE, usual_builds
+from gsmerge.plan.make_plan import is_without_views, note_ignored, plan_scene
+from gsmerge.plan.networks import load_networks
 from gsmerge.prepare.confirm_depths import confirm_depths
 from gsmerge.prepare.crop import crop_scene
 from gsmerge.prepare.prepare_scene import views_notes
@@ -42,7 +35,6 @@ from gsmerge.settings.compact import OURS, CompactOptions
 from gsmerge.special.blocks.partition import gaussians_at_once
 from gsmerge.special.curve import curve_counts
 from gsmerge.special.methods import choose_method
-from gsmerge.stages.counts import level_counts
 from gsmerge.types import Scene
 
 # Most Gaussians of a scene without cameras for which the search is run; it takes seconds

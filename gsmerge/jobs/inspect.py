@@ -17,7 +17,7 @@ from gsmerge.io.formats.read_gaussians import degree_notes
 from gsmerge.io.formats.rows import read_expected_scores
 from gsmerge.io.photo_files import photo_array
 from gsmerge.jobs.estimate import estimate, estimate_lines
-from gsmerge.plan import describe_share
+from gsmerge.plan.counts import describe_share
 from gsmerge.prepare.confirm_depths import confirm_depths
 from gsmerge.prepare.prepare_scene import views_notes
 from gsmerge.prepare.repeats import without_repeats

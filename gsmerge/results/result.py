@@ -15,7 +15,8 @@ from gsmerge.errors import count_words
 from gsmerge.frozen import dataclass, field, replace
 from gsmerge.io.formats.rows import result_comments
 from gsmerge.io.formats.table import Contents
-from gsmerge.plan import Plan, own_views
+from gsmerge.plan.make_plan import own_views
+from gsmerge.plan.plan import Plan
 from gsmerge.prepare.prepared import Prepared
 from gsmerge.prepare.row_colors import OWN_PHOTOS, PHOTOS, RENDERS
 from gsmerge.raster.metrics import SAMPLE_LOSS, describe_distance, describe_loss, is_worse

@@ -25,7 +25,7 @@ from gsmerge.settings.stages import (
 )
 
 OURS = "gsmerge"  # name of the built-in method; all others are plugins
-EFFORT_NAMES = ("draft", "fast", "default", "best")  # gsmerge.plan.EFFORTS has the settings of each
+EFFORT_NAMES = ("draft", "fast", "default", "best")  # gsmerge.plan.efforts.EFFORTS has the settings of each
 CHECKPOINTS = ("auto", "shipped", "paper", "none")  # values of `checkpoint` that are not paths of files
 # A recipe stands for several settings. Settings that a user also gives take precedence. "paper" is the method of the
 # superpixel merging paper: this recipe cuts 476 x 476 pixels into 12,000 superpixels by BASS, from saliency seeds. The

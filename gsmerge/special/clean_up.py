@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from gsmerge.fit import Fitted
 from gsmerge.pipeline import build
-from gsmerge.plan import Plan
+from gsmerge.plan.plan import Plan
 from gsmerge.prepare.prepared import Prepared
 from gsmerge.results.candidate import Candidate, score
 from gsmerge.runtime.record import Record, add_seconds, adopt, begin_part, note, record_choices, record_part

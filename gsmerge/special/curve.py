@@ -17,7 +17,7 @@ from gsmerge.fit.photo_sizes import holdout_psnr, training_weights
 from gsmerge.frozen import dataclass, replace
 from gsmerge.kernels.elementary import log, power
 from gsmerge.pipeline import build
-from gsmerge.plan import Plan
+from gsmerge.plan.plan import Plan
 from gsmerge.prepare.prepared import Prepared
 from gsmerge.raster.metrics import WINDOW, ssim
 from gsmerge.raster.photos import Photos, render_photos, scene_photos

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from gsmerge.errors import UsageError
 from gsmerge.io.formats.rows import MIP_COMMENT, RESULT_COMMENT
 from gsmerge.io.formats.table import Contents, Format
-from gsmerge.plan import Plan
+from gsmerge.plan.plan import Plan
 from gsmerge.prepare.prepared import Prepared
 from gsmerge.results.candidate import Candidate, rescore
 from gsmerge.runtime.memory import human_bytes

@@ -9,7 +9,8 @@ import numpy as np
 
 from gsmerge.frozen import dataclass, replace
 from gsmerge.geometry.views import pick_views, subset
-from gsmerge.plan import Plan, make_plan
+from gsmerge.plan.make_plan import make_plan
+from gsmerge.plan.plan import Plan
 from gsmerge.prepare.prepared import Prepared, Reference
 from gsmerge.prepare.row_colors import PHOTOS
 from gsmerge.raster.photos import NEAR_PLANE, Photos, scene_photos, score_photos

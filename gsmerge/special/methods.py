@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 from gsmerge.errors import UsageError
 from gsmerge.frozen import dataclass
-from gsmerge.plan import Plan
+from gsmerge.plan.plan import Plan
 from gsmerge.prepare.prepare_scene import prepare
 from gsmerge.prepare.prepared import Prepared
 from gsmerge.runtime.plugins import METHODS, load_plugin

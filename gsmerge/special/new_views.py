@@ -17,7 +17,7 @@ from gsmerge.geometry.transforms import camera_distances
 from gsmerge.geometry.views import subset
 from gsmerge.kernels.elementary import power
 from gsmerge.pipeline import build
-from gsmerge.plan import Plan
+from gsmerge.plan.plan import Plan
 from gsmerge.prepare.prepared import Prepared
 from gsmerge.raster.photos import shrink_pictures
 from gsmerge.results.report import CompactReport, NewViews, compared_psnr

@@ -8,7 +8,9 @@ from typing import Any
 
 from gsmerge.kernels.elementary import exp, log, power
 from gsmerge.pipeline import build
-from gsmerge.plan import FIDELITY_LOSS, STAGE_STEPS, Plan, run_parts
+from gsmerge.plan.counts import FIDELITY_LOSS, level_counts
+from gsmerge.plan.forecast import STAGE_STEPS, run_parts
+from gsmerge.plan.plan import Plan
 from gsmerge.prepare.prepared import LEAST_VIEWS, Prepared
 from gsmerge.prepare.row_colors import PHOTOS, RENDERS
 from gsmerge.results.candidate import Candidate, score
@@ -30,7 +32,6 @@ from gsmerge.special.clean_up import build_candidate, clean_fitted, record_dropp
 from gsmerge.special.curve import count_reaching, count_within, curve_counts, curve_knee, measure_curve
 from gsmerge.special.file_size import meet_bytes
 from gsmerge.special.left_out import LeftOut, choose_left_out, leave_out, mean_seen
-from gsmerge.stages.counts import level_counts
 from gsmerge.stages.segment import knee_count
 
 # The slope is the gain of PSNR (dB) per doubling of the count. Until two counts were built, a search assumes these

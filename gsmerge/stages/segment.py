@@ -27,7 +27,7 @@ from gsmerge.kernels.superpixels.ward import adjacent_pairs
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.stages import SegmentOptions
-from gsmerge.stages.counts import CountLimits
+from gsmerge.stages.limits import CountLimits
 from gsmerge.stages.superpixels import segment
 from gsmerge.types import Groups, PicturedScene, Scene, Segmentation
 

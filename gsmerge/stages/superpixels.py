@@ -30,7 +30,7 @@ from gsmerge.kernels.superpixels.regions import pad_labels, refine, split_rectan
 from gsmerge.kernels.superpixels.ward import merge_regions
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.stages import SegmentOptions
-from gsmerge.stages.counts import count_for
+from gsmerge.stages.limits import count_for
 from gsmerge.types import Groups
 
 RECTANGLES, EARLY_SWEEPS = 2.0, 0  # defaults of rdseg: rectangles per superpixel, and sweeps before they are merged

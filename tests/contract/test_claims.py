@@ -15,7 +15,7 @@ import pytest
 from scripts import load_script
 
 import gsmerge
-from gsmerge import plan, types
+from gsmerge import types
 from gsmerge.drawing import render_files as drawings
 from gsmerge.drawing.pages import data, splats
 from gsmerge.fit import outside, photo_sizes, schedule, stage
@@ -26,6 +26,11 @@ from gsmerge.io.formats import ply
 from gsmerge.kernels.raster import blend
 from gsmerge.networks.checkpoint import IN_PACKAGE, load_checkpoint
 from gsmerge.networks.options import RESIDUAL, SLOTS
+from gsmerge.plan import counts
+from gsmerge.plan import fit as fit_plan
+from gsmerge.plan.blocks import BLOCK_GAUSSIANS, BLOCK_VIEWS, WHOLE_GAUSSIANS, WHOLE_VIEWS
+from gsmerge.plan.efforts import EFFORTS
+from gsmerge.plan.make_plan import LONE_K
 from gsmerge.prepare import confirm_depths, exposure, scene_size
 from gsmerge.prepare import fill_holes as holes
 from gsmerge.prepare.prepared import LEAST_VIEWS
@@ -102,16 +107,16 @@ CLAIMS: dict[str, tuple[str, ...]] = {
         f"{fit_pairs.RENDERS_STEP:g} / sqrt(share of Gaussians kept)",
     ),
     LARGE: (
-        f"Scenes of more than {million(plan.WHOLE_GAUSSIANS)} Gaussians with pixels are compacted in blocks of views"
-        f" (`blocks`): one block for every {million(plan.BLOCK_GAUSSIANS)} Gaussians",
-        f"Scenes of more than {plan.WHOLE_VIEWS} views get one block for every {plan.BLOCK_VIEWS} views, if blocks"
+        f"Scenes of more than {million(WHOLE_GAUSSIANS)} Gaussians with pixels are compacted in blocks of views"
+        f" (`blocks`): one block for every {million(BLOCK_GAUSSIANS)} Gaussians",
+        f"Scenes of more than {WHOLE_VIEWS} views get one block for every {BLOCK_VIEWS} views, if blocks"
         f" cut at most a {part(partition.MOST_CUT)}",
         f"A block also takes views of its neighbours, at most a {part(partition.SHARED)} as many as its own",
         f"A block asks for up to {'twice' if blocks.MOST_DENSITY == 2 else blocks.MOST_DENSITY} as many superpixels",
         f"at {seams.SEAM_RATE:g} times the usual ones, and fall to a tenth",
         f"{word(seams.SEAM_VIEW_STEPS)} for each photo that shows many Gaussians at seams, or"
         f" {word(seams.ROOM_VIEW_STEPS)} if at least {part(seams.ROOM_SHARE)} of all Gaussians are at seams",
-        f"The default takes {plan.EFFORTS['default'].steps} steps for up to {plan.USUAL_VIEWS} views",
+        f"The default takes {EFFORTS['default'].steps} steps for up to {fit_plan.USUAL_VIEWS} views",
         f"A block whose process or node was lost is done again, up to {word(work.RETRIES)} times",
         f"| GB per million | {' | '.join(map(degree, range(5)))} |",
     ),
@@ -122,12 +127,12 @@ CLAIMS: dict[str, tuple[str, ...]] = {
         f" | 1.0 MB, {load_checkpoint(IN_PACKAGE['paper']).networks.num_parameters:,} parameters |",
     ),
     COMPACT: (
-        f"--effort draft`: {plan.EFFORTS['draft'].steps} steps, no merging across views",
-        f"--effort fast`: {plan.EFFORTS['fast'].steps} steps",
-        f"--effort best`: {plan.EFFORTS['best'].steps} steps",
+        f"--effort draft`: {EFFORTS['draft'].steps} steps, no merging across views",
+        f"--effort fast`: {EFFORTS['fast'].steps} steps",
+        f"--effort best`: {EFFORTS['best'].steps} steps",
         f"gsmerge keeps at most {SHARE.replace('%', ' %')} of a scene",
         f"at most what the device draws fluidly: {', '.join(f'{count:,}' for count in DEVICES.values())}",
-        f"| `--k` | 1 to {MAX_CHILDREN} | this number for each superpixel; 1 by default, {plan.LONE_K} for a single",
+        f"| `--k` | 1 to {MAX_CHILDREN} | this number for each superpixel; 1 by default, {LONE_K} for a single",
         f"measures quality as PSNR plus {curve.SSIM_DB:g} dB times SSIM",
         f"The useful number of Gaussians is {percent(confirm_depths.MOST_PER_PIXEL)} of the input if other views"
         f" confirm at least {percent(confirm_depths.SOUND_SHARE)} of the depth, and {percent(confirm_depths.FEWEST)} if"
@@ -136,16 +141,16 @@ CLAIMS: dict[str, tuple[str, ...]] = {
         f"The estimate of the gain needs at least {word(LEAST_VIEWS)} photos, a result with at most"
         f" {percent(new_views.MOST_SHARE)} as many Gaussians as pixels",
         f"but at least {SHARE.replace('%', ' %')}, that keep the input's quality",
-        f"if it shows the photos at most {plan.FIDELITY_LOSS:g} dB worse than the input does",
-        f"at least {plan.FIDELITY_PSNR:g} dB against the input's",
+        f"if it shows the photos at most {counts.FIDELITY_LOSS:g} dB worse than the input does",
+        f"at least {counts.FIDELITY_PSNR:g} dB against the input's",
         f"differs at random by more than {percent(exposure.DIFFERENT)}",
         f"at least {photo_sizes.MIN_AUTO_SCALE:g} times as many pixels a side",
         f"wider than a {part(holes.LARGE_SIDE)} of the picture",
         f"cover at least {percent(holes.LARGE_AREA)} of it",
         f"A white pixel counts as {word(int(types.PROTECTED))}",
-        f"Scenes of more than {million(plan.WHOLE_GAUSSIANS)} Gaussians",
+        f"Scenes of more than {million(WHOLE_GAUSSIANS)} Gaussians",
         f"{part(1 / scores.INPUT_EVERY)} of the input's pixels and {part(1 / scores.RESULT_EVERY)} of the result's in"
-        f" {word(views.REPORT_VIEWS)} photos (in drafts: {word(plan.EFFORTS['draft'].report_views)})",
+        f" {word(views.REPORT_VIEWS)} photos (in drafts: {word(EFFORTS['draft'].report_views)})",
     ),
     CONVERT: (
         f"at the upper border of at least {word(sky.LEAST_SKY_VIEWS)} photos and a {part(sky.LEAST_SKY_SHARE)} of all",
@@ -198,7 +203,7 @@ CLAIMS: dict[str, tuple[str, ...]] = {
         f"more than {metrics.MAX_LOSS:g} dB worse than the input does".replace(" 0.", " ."),
         f"less than {metrics.POOR_PSNR:g} dB from its input",
         f"(at most {metrics.MAX_PSNR:g}, for equal pictures)",
-        f"`psnr_kept` ({plan.FIDELITY_PSNR:g}) or `loss_kept` ({plan.FIDELITY_LOSS:g})",
+        f"`psnr_kept` ({counts.FIDELITY_PSNR:g}) or `loss_kept` ({counts.FIDELITY_LOSS:g})",
     ),
     "SECURITY.md": (
         f"{bounds._FREE_MEMORY / 1e6:g} MB + {bounds._MEMORY_PER_BYTE} x its bytes of memory",

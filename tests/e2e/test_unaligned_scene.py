@@ -20,7 +20,7 @@ from tiny_scene import edited_json
 
 import gsmerge
 from gsmerge import read_scene
-from gsmerge.plan import FIDELITY_LOSS
+from gsmerge.plan.counts import FIDELITY_LOSS
 from gsmerge.raster.metrics import MAX_LOSS
 from gsmerge.special.search import MAX_BUILDS
 

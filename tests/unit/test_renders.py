@@ -17,7 +17,7 @@ from gsmerge.fit.report import FitReport
 from gsmerge.geometry.transforms import camera_centres
 from gsmerge.jobs.estimate import estimate
 from gsmerge.pipeline import build
-from gsmerge.plan import make_plan, plan_scene
+from gsmerge.plan.make_plan import make_plan, plan_scene
 from gsmerge.prepare.place_cameras import (
     FEW_RENDERED_VIEWS,
     MOST_OUTSIDE,

@@ -13,7 +13,11 @@ from gsmerge.errors import Doubt
 from gsmerge.fit import fit_scene, peak_weights
 from gsmerge.geometry.frame import Frame, scene_frame
 from gsmerge.geometry.views import subset
-from gsmerge.plan import INPUT_STEPS, STAGE_STEPS, WHOLE_GAUSSIANS, Plan, plan_scene
+from gsmerge.plan.blocks import WHOLE_GAUSSIANS
+from gsmerge.plan.counts import file_size
+from gsmerge.plan.forecast import INPUT_STEPS, STAGE_STEPS
+from gsmerge.plan.make_plan import plan_scene
+from gsmerge.plan.plan import Plan
 from gsmerge.prepare.row_colors import OWN_PHOTOS, PHOTOS
 from gsmerge.prepare.scene_size import SceneSize
 from gsmerge.raster.metrics import SAMPLE_LOSS, describe_loss, is_worse
@@ -51,7 +55,6 @@ from gsmerge.special.blocks.partition import (
 from gsmerge.special.blocks.start_block import BlockStart, start_block
 from gsmerge.special.file_size import drop_to_bytes, measure_least_bytes
 from gsmerge.stages.clean import faintest_dropped
-from gsmerge.stages.counts import file_size
 from gsmerge.stages.prune import split_unseen
 from gsmerge.types import Cameras, Decoded, Gaussians, Scene
 

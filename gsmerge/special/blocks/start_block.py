@@ -7,7 +7,8 @@ import numpy as np
 from gsmerge.frozen import dataclass, replace
 from gsmerge.geometry.frame import Frame
 from gsmerge.pipeline import merge_views
-from gsmerge.plan import Plan, make_plan
+from gsmerge.plan.make_plan import make_plan
+from gsmerge.plan.plan import Plan
 from gsmerge.prepare.prepare_scene import prepare
 from gsmerge.prepare.prepared import Prepared
 from gsmerge.results.scores import measure_input

@@ -15,7 +15,7 @@ import gsmerge
 from gsmerge import Cameras, Scene
 from gsmerge.geometry.pooling import scene_members
 from gsmerge.kernels.elementary import log
-from gsmerge.plan import make_plan
+from gsmerge.plan.make_plan import make_plan
 from gsmerge.prepare.confirm_depths import (
     AGREEMENT_PIXELS,
     AGREEMENT_SHARE,

@@ -21,7 +21,7 @@ from gsmerge.geometry.transforms import (
     quat_to_rotmat,
 )
 from gsmerge.geometry.transforms import without_common_motion as without_common
-from gsmerge.plan import make_plan
+from gsmerge.plan.make_plan import make_plan
 from gsmerge.prepare.move_poses import CHANCE, move_poses
 from gsmerge.prepare.prepare_scene import prepare
 from gsmerge.raster import render

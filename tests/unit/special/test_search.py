@@ -13,7 +13,8 @@ from messages import noted, refuses
 
 from gsmerge.fit import FitOptions, Fitted
 from gsmerge.kernels import elementary
-from gsmerge.plan import FIDELITY_LOSS, Plan
+from gsmerge.plan.counts import FIDELITY_LOSS, exact_count, level_counts, max_allowed
+from gsmerge.plan.plan import Plan
 from gsmerge.prepare.prepared import Prepared
 from gsmerge.prepare.row_colors import PHOTOS
 from gsmerge.results.candidate import Candidate
@@ -23,7 +24,6 @@ from gsmerge.settings.stages import CleanOptions
 from gsmerge.special.curve import CurvePoint, count_within, curve_counts, curve_knee
 from gsmerge.special.left_out import LeftOut
 from gsmerge.special.search import MAX_BUILDS, MAX_LEFT_OUT_BUILDS, SAME_COUNT_RATIO, CountSearch, search_count
-from gsmerge.stages.counts import exact_count, level_counts, max_allowed
 from gsmerge.types import Cameras, Gaussians
 
 

@@ -14,6 +14,7 @@ from gsmerge import Scene, compact
 from gsmerge.errors import UsageError
 from gsmerge.geometry.frame import canonicalise, scene_frame
 from gsmerge.geometry.pooling import scene_members
+from gsmerge.plan.counts import FEW_PIXELS, superpixels_per_view
 from gsmerge.prepare.place_cameras import add_views
 from gsmerge.prepare.prepare_scene import prepare
 from gsmerge.prepare.scene_size import measure_size
@@ -21,7 +22,6 @@ from gsmerge.prepare.true_pixels import with_pixels
 from gsmerge.runtime.record import record_run
 from gsmerge.settings.stages import SegmentOptions
 from gsmerge.stages.assign import assign, find_owners, middle_pixels, owner_pixels
-from gsmerge.stages.counts import FEW_PIXELS, superpixels_per_view
 from gsmerge.stages.encode import encode, member_rows
 from gsmerge.stages.superpixels import segment
 from gsmerge.types import NO_CAMERAS, Groups, make_scene

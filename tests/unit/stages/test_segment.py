@@ -10,11 +10,11 @@ import scenes
 from messages import refuses
 
 from gsmerge import CompactOptions, Scene
-from gsmerge.plan import make_plan
+from gsmerge.plan.make_plan import make_plan
 from gsmerge.prepare.prepare_scene import prepare
 from gsmerge.settings.stages import SegmentOptions
 from gsmerge.stages import segment as module
-from gsmerge.stages.counts import CountLimits
+from gsmerge.stages.limits import CountLimits
 from gsmerge.stages.segment import (
     RegionTree,
     SharedTree,

@@ -11,7 +11,7 @@ from messages import refuses
 
 from gsmerge.kernels.superpixels.bass import seed_density, seeds_from_density
 from gsmerge.settings.stages import SEGMENTATIONS, SegmentOptions
-from gsmerge.stages.counts import count_for
+from gsmerge.stages.limits import count_for
 from gsmerge.stages.superpixels import saliency, segment, superpixels
 
 

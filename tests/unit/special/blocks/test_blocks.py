@@ -17,7 +17,7 @@ from gsmerge.fit import FitJob, FitOptions, fit_gaussians
 from gsmerge.fit.photo_sizes import fit_photos
 from gsmerge.geometry.frame import canonicalise
 from gsmerge.geometry.views import subset
-from gsmerge.plan import choose_blocks
+from gsmerge.plan.blocks import choose_blocks
 from gsmerge.prepare.row_colors import ROW_COLORS
 from gsmerge.prepare.scene_size import measure_size
 from gsmerge.runtime import memory
@@ -149,8 +149,8 @@ def test_small_scenes_stay_in_one_piece(scene: Scene) -> None:
 
 
 def test_large_scenes_are_cut_into_blocks(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gsmerge.plan.WHOLE_GAUSSIANS", 1800)
-    monkeypatch.setattr("gsmerge.plan.BLOCK_GAUSSIANS", 1440)
+    monkeypatch.setattr("gsmerge.plan.blocks.WHOLE_GAUSSIANS", 1800)
+    monkeypatch.setattr("gsmerge.plan.blocks.BLOCK_GAUSSIANS", 1440)
     assert count_blocks(scene) == 3
     assert count_blocks(scene, levels=2) == 1
 

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gsmerge import CompactOptions
-from gsmerge.plan import wanted_blocks
+from gsmerge.plan.blocks import wanted_blocks
 from gsmerge.special.blocks.partition import (
     SHARED,
     Block,

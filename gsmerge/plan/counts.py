@@ -1,14 +1,22 @@
-"""Limit the number of Gaussians by superpixels and K, and by budgets, file sizes and devices."""
+"""Decide the number of Gaussians: by superpixels and K, by budgets, file sizes and devices, or by a quality to keep."""
 
 from __future__ import annotations
 
 from gsmerge.errors import UsageError
-from gsmerge.frozen import dataclass
+from gsmerge.frozen import dataclass, replace
 from gsmerge.io.formats.table import PLY, Format, count_for_bytes, output_format
+from gsmerge.prepare.confirm_depths import FEWEST, Agreement
 from gsmerge.prepare.scene_size import SceneSize
+from gsmerge.runtime.record import note
 from gsmerge.settings.budget import AUTO, DEVICES, BudgetOptions, parse_budget, parse_bytes
-from gsmerge.settings.stages import DecodeOptions, SegmentOptions
+from gsmerge.settings.compact import OURS, CompactOptions
+from gsmerge.settings.stages import SHARE, DecodeOptions, SegmentOptions
+from gsmerge.stages.limits import CountLimits, count_for
 
+# If a scene has neither photos nor pixels, its result has by default at least this PSNR (dB) against the input
+FIDELITY_PSNR = 32.5
+# If a scene has photos but no pixels, its result by default loses at most this PSNR (dB) on the photos
+FIDELITY_LOSS = 0.3
 STREAMED_LEVELS = 3  # levels of detail of a lod-meta.json; the coarsest, a sixteenth of the Gaussians, loads at once
 LEVEL_FACTOR = 4  # each level of detail has this many times fewer Gaussians than the next finer level
 FEW_PIXELS = 1 << 18  # pixels of a few small photos
@@ -16,6 +24,53 @@ FEW_PIXELS = 1 << 18  # pixels of a few small photos
 # scene of few Gaussians the number of superpixels is a share of the pixels, but at most FEW times the number of
 # Gaussians
 FEW = 0.5
+
+
+def keeps_fidelity(scene: SceneSize, options: CompactOptions) -> bool:
+    """Return whether the run searches for the fewest Gaussians that keep the quality of the input.
+
+    The run searches if the options do not decide the number, and the scene has no photos or few Gaussians per pixel.
+    With few Gaussians per pixel, no usual share of the Gaussians is right: a scene that is compact already needs most
+    of its Gaussians, and a scene of many small Gaussians needs only a few. Without photos, the PSNR of the result
+    against renders of the input has to be ``FIDELITY_PSNR``. With photos, the PSNR of the result on the photos may be
+    ``FIDELITY_LOSS`` dB lower than that of the input. Measurements are in docs/internals/decisions.md.
+    """
+    # with half a Gaussian per pixel or more, the usual share of the Gaussians is enough to show the photos
+    is_dense = scene.has_own_pixels or scene.num_gaussians >= 0.5 * scene.num_views * scene.pixels_per_view > 0
+    may_keep = scene.rendered or options.budget.keep or not (is_dense or options.budget.auto)
+    return may_keep and options.scene_decides
+
+
+def resolve_budget(size: SceneSize, options: CompactOptions, agreement: Agreement | None) -> CompactOptions:
+    """Fill in the number of Gaussians beyond which new views gain nothing, with a note.
+
+    The more the views confirm each other's depth, the larger is this number of Gaussians. If the budget is "auto", it
+    becomes this number. If the budget is a share, a size or a device, this number is its upper limit.
+    """
+    budget = options.budget
+    is_limit = budget.is_limit and options.method == OURS
+    if agreement is None or options.fit.fit == "none" or not (budget.auto or is_limit):
+        return options
+    text, why = describe_share(agreement)
+    if budget.auto:
+        note(f"budget: {text} of the input, because {why}")
+        return replace(options, budget=replace(budget, budget=text))
+    most = max(size.num_views, int(agreement.share * size.num_gaussians))
+    if most < max_allowed(budget, size.num_gaussians, size.sh_degree):
+        limit = f"limited to {most:,} Gaussians, {text} of the input"
+        reason = f"more would not show new views better, because {why}; --set fill=true takes the whole budget"
+        note(f"budget {budget.budget}: {limit}; {reason}")
+        is_only_count = options.changed_counts == ["budget"]
+        if is_only_count and agreement.share <= FEWEST:  # a run without a budget would have the same number
+            budget = replace(budget, budget=None)
+    return replace(options, budget=replace(budget, most=most))
+
+
+def describe_share(agreement: Agreement | None) -> tuple[str, str]:
+    """Return the useful number of Gaussians as a share of the pixels, such as "10%", and the reason for a note."""
+    if agreement is None:
+        return SHARE, "depths of several views cannot be compared"
+    return f"{100 * agreement.share:.3g}%", f"other views confirm {100 * agreement.confirmed:.0f} % of the pixels"
 
 
 def exact_count(options: BudgetOptions, num_input: int, sh_degree: int) -> int | None:
@@ -77,32 +132,6 @@ def max_allowed(options: BudgetOptions, num_input: int, sh_degree: int) -> int:
     """
     limits = DEVICES.get(str(options.budget)), exact_count(options, num_input, sh_degree), options.most
     return min([num_input, *(limit for limit in limits if limit is not None)])
-
-
-@dataclass(frozen=True)
-class CountLimits:
-    """Limits on the number of Gaussians that follow from the options."""
-
-    per_view: int  # Superpixels of each view that the options ask for
-    default: int  # Gaussians that `superpixels` and K give
-    min_count: int  # Least number of Gaussians of a result: one for each view
-    max_count: int  # Largest number of Gaussians that a budget, a size or a device allows
-    exact: int | None  # Gaussians that a budget or a size requests; None if neither is given
-    num_pixels: int  # Pixels of all views
-    num_input: int  # Gaussians of the scene
-    most: int  # Useful number of Gaussians; if it is unknown, all Gaussians of the scene
-
-    @property
-    def count(self) -> int | None:
-        """Number of Gaussians that a budget, a size or a device sets; None if ``superpixels`` and K decide it."""
-        if self.exact is not None:
-            return self.exact
-        return self.max_count if self.default > self.max_count else None
-
-    @property
-    def share(self) -> float:
-        """Gaussians per pixel."""
-        return (self.count or self.default) / max(1, self.num_pixels)
 
 
 def count_limits(
@@ -167,13 +196,3 @@ def has_few_rows(scene: SceneSize) -> bool:
 def _few_pixels(scene: SceneSize) -> int:
     """Return the number of pixels of all views, at most ``FEW_PIXELS``."""
     return min(FEW_PIXELS, scene.num_views * scene.pixels_per_view)
-
-
-def count_for(options: SegmentOptions, height: int, width: int) -> int:
-    """Return the number of superpixels of a view of ``height`` x ``width`` pixels; UsageError if these are too few."""
-    if options.per_view is not None:
-        if options.per_view > height * width:
-            limit = f"{height * width}, one per pixel of {width} x {height}"
-            raise UsageError(f"superpixels: expected at most {limit}, got {options.per_view}")
-        return options.per_view
-    return max(1, int(options.share * height * width))

@@ -1,0 +1,1 @@
+"""The plan of a run: every decision that is made before the first superpixel."""

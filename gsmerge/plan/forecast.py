@@ -1,0 +1,34 @@
+"""The parts that a run is expected to have, with their work."""
+
+from __future__ import annotations
+
+from gsmerge.plan.plan import Plan
+from gsmerge.prepare.prepared import Prepared
+from gsmerge.prepare.row_colors import RENDERS
+from gsmerge.runtime.record import RunPart
+
+# Number of candidates that a search usually builds: first, if photos score them; second, if renders of the input do
+USUAL_BUILDS, USUAL_BUILDS_OF_RENDERS = 3, 1
+# Work of the stages of a build, and of scoring the input, for each view, in steps of a fit
+STAGE_STEPS, INPUT_STEPS = 10.0, 3.0
+# Cost of the trial that estimates new views, as a share of building the result; cost of building a coarser level of
+# detail, as a share of building the next finer level
+TRIAL_SHARE, LEVEL_SHARE = 0.25, 0.6
+
+
+def usual_builds(*, has_target: bool, rendered: bool) -> int:
+    """Return how many results a run usually builds; ``rendered``: renders of the input stand for photos."""
+    return (USUAL_BUILDS_OF_RENDERS if rendered else USUAL_BUILDS) if has_target else 1
+
+
+def run_parts(prepared: Prepared, plan: Plan) -> list[RunPart]:
+    """Return the parts that a run in one piece is expected to have, in their order, after the fits of a curve."""
+    views, steps = len(prepared.scene), 0 if plan.fit.fit == "none" else plan.fit.steps
+    build = RunPart("build", STAGE_STEPS * views, steps)
+    count = usual_builds(has_target=plan.target_psnr is not None, rendered=prepared.reference.name == RENDERS)
+    trial = RunPart("trial", TRIAL_SHARE * build.stages, TRIAL_SHARE * steps)
+    shares = [1.0] * count + [LEVEL_SHARE**level for level in range(1, plan.levels)]
+    return [
+        *(RunPart("build", share * build.stages, share * steps) for share in shares),
+        RunPart("input", INPUT_STEPS * views), *([trial] if plan.new_views else []),
+    ]  # fmt: skip

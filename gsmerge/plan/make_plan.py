@@ -1,0 +1,224 @@
+"""Options and facts -> plan: only this package decides what effort, budget, recipe and names of checkpoints mean.
+
+:func:`make_plan` makes all choices for a prepared scene or block. :func:`plan_scene` makes only the choices that need
+no computation, for estimates and for scenes in blocks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from gsmerge.errors import UsageError
+from gsmerge.fit import start_share
+from gsmerge.frozen import replace
+from gsmerge.geometry.views import pick_views, scored_views
+from gsmerge.plan.counts import (
+    FIDELITY_PSNR,
+    count_limits,
+    describe_share,
+    file_size,
+    has_few_rows,
+    keeps_fidelity,
+    resolve_budget,
+)
+from gsmerge.plan.efforts import EFFORTS
+from gsmerge.plan.fit import SHORT_STEPS, fit_to_pictures, resolve_fit
+from gsmerge.plan.networks import choose_networks, cuts_views, load_networks
+from gsmerge.plan.plan import Plan
+from gsmerge.prepare.prepared import Prepared
+from gsmerge.prepare.row_colors import RENDERS
+from gsmerge.prepare.scene_size import SceneSize
+from gsmerge.raster.photos import scored_tiles
+from gsmerge.runtime.record import note, stage
+from gsmerge.settings.budget import AUTO
+from gsmerge.settings.compact import COUNTS, OURS, CompactOptions
+from gsmerge.settings.setting import flat_settings
+from gsmerge.settings.stages import SHARE, USUAL_K, DecodeOptions, MatchOptions, PrepareOptions, SegmentOptions
+from gsmerge.stages.fit_pairs import choose_power
+from gsmerge.stages.segment import SharedTree, SuperpixelChoices
+from gsmerge.types import Gaussians, Scene
+
+if TYPE_CHECKING:
+    from gsmerge.networks.checkpoint import Checkpoint
+
+
+LONE_K = 4  # K if all views have the same camera, because no other view adds Gaussians to a surface
+
+
+def make_plan(
+    prepared: Prepared,
+    options: CompactOptions,
+    checkpoint: Checkpoint | None = None,
+    run: Callable[[Prepared, Plan, int], Gaussians] | None = None,
+) -> Plan:
+    """Make all decisions about a run that the options leave open.
+
+    The networks are also loaded, because some decisions depend on them. ``checkpoint`` has networks to use instead of
+    the networks that the options name. ``run`` is the field of :class:`Plan`. Raises UsageError if the scene or the
+    networks do not allow what the options ask for.
+    """
+    check_pictures(prepared, options)
+    with stage("prepare"):
+        size, budget, cameras = prepared.size, options.budget, prepared.scene.cameras
+        checkpoint = checkpoint or load_networks(options, size)
+        filled = fill_options(prepared, options)
+        has_repeats = len(prepared.scene) < len(prepared.input_scene)
+        num_input = prepared.input_scene.num_gaussians if has_repeats else None  # a budget may be a share of it
+        plan = plan_scene(size, filled, num_input=num_input, keeps=keeps_fidelity(size, options))
+        merges_pairs = plan.merges_pairs and checkpoint is None
+        fit = fit_to_pictures(prepared, filled, plan.fit, merges_pairs=merges_pairs)
+        if plan.keeps_fidelity and has_few_rows(size):
+            few = f"the scene has only {size.num_gaussians:,} Gaussians, fewer than its photos need"
+            note(f"{few}; the result has at most half of them, and more may show the photos better: --budget NUMBER")
+        # a quality that the user asks for is measured on all pixels, and small views have too few tiles for a sample
+        samples = plan.target_psnr is None and not plan.keeps_fidelity
+        samples = samples and scored_tiles(0, cameras.width, cameras.height, 2) is not None
+        # Views among those whose pictures show the scene. The effort decides how many a report needs; scores that
+        # decide the number of Gaussians take more. All views that were placed count
+        scored = own_views(prepared)
+        if not prepared.reference.placed:
+            report_views, num_views = EFFORTS[options.effort].report_views, len(scored)
+            chosen = pick_views(num_views, report_views) if samples else scored_views(num_views)
+            scored = tuple(scored[i] for i in chosen)
+        # all builds of a run share one tree of regions, by which they cut the views
+        has_tree = plan.has_quality or plan.levels > 1 or plan.limits.count is not None
+        has_tree = has_tree and cuts_views(options, size) and not merges_pairs
+        plan = replace(
+            plan,
+            superpixels=replace(plan.superpixels, shared=SharedTree() if has_tree else None),
+            fit=fit,
+            merges_pairs=merges_pairs,
+            file_size=file_size(budget),
+            scored_views=scored,
+            samples=samples,
+            checkpoint=checkpoint,
+            settings=replace(options, decode=plan.decode).to_dict() | {"fit_steps": fit.steps},
+            run=run,
+            new_views=plan.new_views and prepared.agreement is not None and prepared.can_leave_out,
+        )
+        if merges_pairs:
+            count = plan.limits.count or plan.limits.default
+            plan = replace(plan, power=choose_power(count, prepared, fit, plan.seed))
+    return plan
+
+
+def plan_scene(
+    size: SceneSize, options: CompactOptions, *, num_input: int | None = None, keeps: bool | None = None
+) -> Plan:
+    """Make the decisions that follow from the scene's size and the options; UsageError for impossible options.
+
+    Estimates, and scenes in blocks, need no more; :func:`make_plan` adds what follows from the pictures. ``num_input``:
+    see :func:`gsmerge.plan.counts.count_limits`. ``keeps``: what :func:`keeps_fidelity` has returned for the options
+    of the caller; None: what this function returns for ``options``.
+    """
+    effort, budget, segment = EFFORTS[options.effort], options.budget, options.segment
+    decode = resolve_decode(options, size)
+    keeps = keeps_fidelity(size, options) if keeps is None else keeps
+    if segment.superpixels == AUTO:  # deciding it would need computation
+        segment = replace(segment, superpixels=SHARE)
+    segment = replace(
+        segment,
+        rectangles=effort.rectangles if segment.rectangles is None else segment.rectangles,
+        early_sweeps=effort.early_sweeps if segment.early_sweeps is None else segment.early_sweeps,
+    )
+    limits = count_limits(size, segment, decode, budget, num_input=num_input)
+    fit = resolve_fit(options, size, limits)
+    match = options.match.match or ("overlap" if effort.merges else "none")
+    networks = choose_networks(replace(options, fit=fit), size)
+    # Views are cut into superpixels if they have pictures other than renders, or if a setting changes superpixels. A
+    # setting of the number of superpixels does not count, because it only says how many Gaussians there are. Without
+    # superpixels, neighbouring Gaussians are merged pair by pair
+    cuts = size.num_views > 0 and (not size.rendered or options.changes_superpixels)
+    # Without a fit, new views look as good as the views of the input, so they need no estimate
+    new_views = fit.fit != "none" and options.effort != "draft" if options.new_views is None else options.new_views
+    return Plan(
+        superpixels=SuperpixelChoices(segment, limits, start_share(fit), None),
+        match=replace(options.match, match=match),
+        decode=decode,
+        fit=fit,
+        merges_pairs=options.method == OURS and networks == "none" and not cuts,
+        clean=options.clean,
+        target_psnr=FIDELITY_PSNR if keeps and size.rendered else budget.target_psnr,
+        keeps_fidelity=keeps,
+        max_drop=budget.max_drop,
+        auto_count=budget.auto,
+        levels=budget.levels,
+        output=budget.output,
+        seed=options.seed,
+        settings=options.to_dict() | {"k": decode.k, "match": match, "checkpoint": networks},
+        free_poses=options.prepare.poses == "free",
+        new_views=new_views,
+    )
+
+
+def is_without_views(scene: Scene, options: CompactOptions) -> bool:
+    """Return whether a run works without views: the scene has none, and no option asks for a stage that needs views.
+
+    Without views, Gaussians are merged with their neighbours, by positions and colours alone.
+    """
+    return len(scene) == 0 and not options.replaces_stages
+
+
+def note_ignored(scene: Scene, options: CompactOptions) -> None:
+    """Add a note on changed settings that have no effect because the scene has no views."""
+    kinds = (PrepareOptions, SegmentOptions, MatchOptions, DecodeOptions)
+    ignored = options.changed(name for kind in kinds for name in flat_settings(kind) if name not in COUNTS)
+    if ignored and is_without_views(scene, options):
+        note(f"these settings have no effect without cameras: {', '.join(ignored)}")
+
+
+def fill_options(prepared: Prepared, options: CompactOptions) -> CompactOptions:
+    """Fill in budget, K, superpixels and clean-up if the options leave them to the scene; notes say why."""
+    size, agreement = prepared.size, prepared.agreement
+    options = resolve_budget(size, options, agreement)
+    decode, segment, clean = resolve_decode(options, size), options.segment, options.clean
+    if segment.superpixels == AUTO:
+        text, why = describe_share(agreement)
+        note(f"superpixels: {text} of the pixels, because {why}")
+        segment = replace(segment, superpixels=text)
+    if "sky" in clean.drops and prepared.reference.name == RENDERS:
+        note("drop sky: no photo that is used shows where the sky is, so it is kept")
+        clean = replace(clean, drop=",".join(name for name in clean.drops if name != "sky") or None)
+    if decode.k != options.decode.k and decode.max_k > USUAL_K:
+        note(f"k: {decode.k}, because one camera shows the scene, and no long fit follows")
+    return replace(options, decode=decode, segment=segment, clean=clean)
+
+
+def check_pictures(prepared: Prepared, options: CompactOptions) -> None:
+    """Raise UsageError for settings that need photos if there are none."""
+    if prepared.reference.name != RENDERS:
+        return
+    if options.budget.max_drop is not None:
+        problem = f'quality {options.budget.quality}: expected a PSNR against the input, such as "35dB", without photos'
+        raise UsageError(f"{problem}; without photos nothing shows the scene better than the input; or give --images")
+    if "sky" in options.clean.drops and prepared.input_scene.images is None:
+        raise UsageError("drop sky: expected photos, which show where the sky is; name them with --images")
+
+
+def resolve_decode(options: CompactOptions, scene: SceneSize) -> DecodeOptions:
+    """Choose K if the option is "auto": 4 if all views have the same camera and no long fit follows, otherwise 1.
+
+    A single view has too few Gaussians with K = 1, because it has only 4.4 superpixels per 100 pixels. With several
+    cameras, each surface gets Gaussians from several views.
+    """
+    decode = options.decode
+    if decode.k != AUTO:
+        return decode
+    if not (scene.has_own_pixels and scene.num_cameras == 1):
+        return replace(decode, k=USUAL_K)
+    decides_count = options.budget.quality is not None or options.changed_counts
+    steps = EFFORTS[options.effort].steps if options.fit.fit_steps is None else options.fit.fit_steps
+    has_long_fit = options.fit.fit != "none" and steps > SHORT_STEPS
+    keeps_k = decides_count or options.replaces_stages or has_long_fit
+    return replace(decode, k=USUAL_K if keeps_k else LONE_K)
+
+
+def own_views(prepared: Prepared) -> tuple[int, ...]:
+    """Return the views whose pictures show the scene: views that were placed, or views of the input.
+
+    Views of the input are numbered as in the input, where a view may be repeated.
+    """
+    if not prepared.reference.of_views:
+        return prepared.reference.score_views
+    return tuple(view for view, place in enumerate(prepared.repeated) if place in prepared.reference.score_views)

@@ -1,0 +1,108 @@
+"""A plan: all decisions about a run, made before the first superpixel is cut; each stage takes its own part."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from gsmerge.frozen import dataclass, replace
+from gsmerge.plan.counts import FileSize
+from gsmerge.prepare.prepared import Prepared
+from gsmerge.settings.fit import FitOptions
+from gsmerge.settings.stages import CleanOptions, DecodeOptions, MatchOptions
+from gsmerge.stages.limits import CountLimits
+from gsmerge.stages.pair_merge import POWERS
+from gsmerge.stages.segment import SuperpixelChoices
+from gsmerge.types import Gaussians
+
+if TYPE_CHECKING:
+    from gsmerge.networks.checkpoint import Checkpoint
+    from gsmerge.networks.weights import NetworkWeights
+    from gsmerge.raster.photos import PhotoScore
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """All decisions about a run, made before the first superpixel is cut."""
+
+    superpixels: SuperpixelChoices  # How each view is cut, and into how many
+    match: MatchOptions  # Merging across views
+    decode: DecodeOptions  # Gaussians per group
+    fit: FitOptions  # Fit to the photos
+    merges_pairs: bool  # Merge neighbours pair by pair instead of superpixels
+    clean: CleanOptions  # What is left out of the result
+    target_psnr: float | None  # PSNR (dB) that the result has to reach; None: no target, or not known yet
+    keeps_fidelity: bool  # See :func:`keeps_fidelity`
+    max_drop: float | None  # Allowed loss in dB against the best of the curve; None: no target
+    auto_count: bool  # The scene's own curve decides the number of Gaussians
+    levels: int  # Levels of detail
+    output: str  # Name of the output's file, whose format may round values; "": no file
+    seed: int  # All random choices depend on this number alone
+    settings: dict[str, Any]  # All settings by flat name, for reports
+    scored_views: tuple[int, ...] = ()  # Ids of the views in which input and result are scored
+    checkpoint: Checkpoint | None = None  # Networks, from a file; None: closed formulas alone
+    file_size: FileSize | None = None  # Largest size of the output's file; None: any
+    power: float = POWERS[0]  # Power of the masses by which pairs are merged
+    free_poses: bool = False  # The options ask the fit to move cameras, even if the scene does not need it
+    samples: bool = False  # Only a sample of the pixels is scored, because only the report needs the scores
+    new_views: bool = False  # Estimate the quality of new views
+    # How another package builds a number of Gaussians; None: gsmerge's own stages build them
+    run: Callable[[Prepared, Plan, int], Gaussians] | None = None
+    is_trial: bool = False  # The result is only scored on left-out photos, so gaps need not be filled
+    before: PhotoScore | None = None  # Score of the input, if the result has to keep its quality on photos
+    # [h,w] bool for each scored view: the pixels that the input covers, if it leaves gaps and its renders stand for
+    # photos
+    covered: tuple[np.ndarray, ...] | None = None
+
+    @property
+    def networks(self) -> NetworkWeights | None:
+        """Networks that correct the results of the stages; None: closed formulas."""
+        return None if self.checkpoint is None else self.checkpoint.networks
+
+    @property
+    def network_facts(self) -> dict[str, Any]:
+        """Facts about the networks that a report has, by name; empty without networks."""
+        return {} if self.checkpoint is None else {"networks": self.checkpoint.facts()}
+
+    @property
+    def by_contribution(self) -> bool:
+        """Return whether blending weights decide to which superpixel a Gaussian belongs, as in the paper."""
+        return self.networks is not None and self.networks.options.makes_children
+
+    @property
+    def weakens(self) -> bool:
+        """Return whether a group starts with less opacity if other views see surfaces behind it.
+
+        The lower opacity may leave holes, which a long fit closes.
+        """
+        return self.superpixels.start_share < 1 and self.checkpoint is None
+
+    @property
+    def prunes(self) -> bool:
+        """Return whether Gaussians that no photo shows are dropped after the fit."""
+        return self.fit.min_contribution > 0
+
+    @property
+    def has_quality(self) -> bool:
+        """Return whether a quality or the scene's curve decides the number of Gaussians."""
+        return self.target_psnr is not None or self.max_drop is not None or self.auto_count or self.keeps_fidelity
+
+    @property
+    def searches(self) -> bool:
+        """Return whether several counts may be built: for a quality, for the file's size, or to clean up a result."""
+        return self.has_quality or (self.file_size is not None and self.file_size.packed) or self.clean.asked
+
+    @property
+    def limits(self) -> CountLimits:
+        """Limits of the number of Gaussians."""
+        return self.superpixels.limits
+
+    def with_fixed_cameras(self) -> Plan:
+        """Return the plan with a fit that does not move cameras."""
+        return replace(self, fit=replace(self.fit, move_cameras=False))
+
+    def with_fit(self, fit: FitOptions) -> Plan:
+        """Return the plan with the fit ``fit``, which starts with all Gaussians."""
+        return replace(self, fit=fit, superpixels=replace(self.superpixels, start_share=1.0))
