@@ -265,8 +265,8 @@ def values_table(run: Run) -> str:
 def first_steps(run: Run) -> list[str]:
     """Write the steps before anything is built: the scene is read and prepared, and the run is planned."""
     prepared, plan, made = run.prepared, run.made["make_plan"], run.made["find_pixels"]
-    pixels, limits, recovery = WIDTH * HEIGHT, plan.limits, made.recovery
-    first = int(limits.per_view * plan.superpixels.start_share)
+    pixels, limits, recovery = WIDTH * HEIGHT, plan.count.limits, made.recovery
+    first = int(limits.per_view * plan.merge.superpixels.start_share)
     scene = prepared.input_scene
     own = scene.has_own_pixels and scene.pixels.shown.all() and int(scene.pixels.fronts[VIEW, Y, X]) == ROW
     return [
@@ -298,7 +298,7 @@ def first_steps(run: Run) -> list[str]:
             say(
                 "No option limits the number of Gaussians, and every Gaussian belongs to a pixel, so `make_plan` allows"
                 f" {plan.settings['superpixels']} of the {pixels:,} pixels of each view, {limits.default:,} in all.",
-                limits.exact is None and not plan.keeps_fidelity and plan.target_psnr is None,
+                limits.exact is None and not plan.count.keeps_fidelity and plan.count.target_psnr is None,
             ),
             say(
                 f"The fit starts with only {first} superpixels of each view, because it adds Gaussians itself where"
@@ -307,7 +307,7 @@ def first_steps(run: Run) -> list[str]:
             ),
             say(
                 "Networks are not used, because a fit to photos gains more.",
-                plan.checkpoint is None and prepared.reference.of_views,
+                plan.merge.checkpoint is None and prepared.reference.of_views,
             ),
         ),
     ]  # fmt: skip
@@ -334,7 +334,7 @@ def build_steps(run: Run) -> list[str]:
             say(
                 f"opacities. `correct` makes {faint} of the {len(features)} Feature Gaussians fainter,"
                 " because more views see through them than confirm their depth.",
-                plan.weakens and faint > 0,
+                plan.merge.weakens and faint > 0,
             ),
         ),
         step(
@@ -343,14 +343,14 @@ def build_steps(run: Run) -> list[str]:
             say(
                 "has one of each of the views"
                 f" {', '.join(map(str, features.views[own][:-1]))} and {features.views[own][-1]}.",
-                len({*features.views[own]}) == len(own) > 1 and plan.match.match == "overlap",
+                len({*features.views[own]}) == len(own) > 1 and plan.merge.match.match == "overlap",
             ),
             f"`merge` makes {len(merged)} of the {len(features)} Feature Gaussians, one for each cluster.",
         ),
         step(
             "Decode",
             f"Each of the {len(merged)} becomes one Gaussian,",
-            say("because K is 1.", plan.decode.k == 1 and len(decoded.gaussians) == len(merged)),
+            say("because K is 1.", plan.merge.decode.k == 1 and len(decoded.gaussians) == len(merged)),
         ),
         step(
             "Fit",

@@ -10,7 +10,7 @@ from dataclasses import replace
 from gsmerge.fit import Fitted, fit_scene
 from gsmerge.geometry.pooling import Members
 from gsmerge.networks.corrector import ANALYTIC, Corrector
-from gsmerge.plan.plan import Plan
+from gsmerge.plan.plan import MergePlan, Plan
 from gsmerge.prepare.prepared import Prepared
 from gsmerge.prepare.row_colors import RENDERS
 from gsmerge.runtime.record import record_choices
@@ -34,12 +34,14 @@ def build(prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
     dropped as new Gaussians are added. Trials and an unchanged input are returned as they are.
     """
     if plan.run is not None:  # the method of another package
-        gaussians = plan.run(prepared, plan, plan.limits.default if count is None else count)
+        gaussians = plan.run(prepared, plan, plan.count.limits.default if count is None else count)
         return Fitted(gaussians, prepared.scene.cameras, None)
     if plan.merges_pairs:
         from gsmerge.stages.fit_pairs import build_pairs
 
-        return build_pairs(prepared, plan.limits.default if count is None else count, plan.power, plan.fit, plan.seed)
+        return build_pairs(
+            prepared, plan.count.limits.default if count is None else count, plan.merge.power, plan.fit, plan.seed
+        )
     scene, start = prepared.scene, merge_views(prepared, plan, count)
     if start.is_input and (plan.fit.fit == "none" or prepared.reference.name == RENDERS):
         return Fitted(start.gaussians, scene.cameras, None)  # the pictures show exactly these Gaussians
@@ -68,21 +70,23 @@ def merge_views(prepared: Prepared, plan: Plan, count: int | None) -> Decoded:
     scene = prepared.scene
     if count is not None and count >= len(scene.gaussians):
         return Decoded(scene.gaussians, len(scene.gaussians), exact=True, is_input=True)
-    segmentation = segment_scene(scene, plan.superpixels, count)
-    features, members, networks = encode_groups(scene, segmentation.groups, plan)
-    merged = networks.refine(merge(features, match(features, plan.match), networks))
-    record_choices(groups=len(features), clusters=len(merged), **plan.network_facts)
+    segmentation = segment_scene(scene, plan.merge.superpixels, plan.count.limits, count)
+    features, members, networks = encode_groups(scene, segmentation.groups, plan.merge, plan.seed)
+    merged = networks.refine(merge(features, match(features, plan.merge.match), networks))
+    record_choices(groups=len(features), clusters=len(merged), **plan.merge.network_facts)
     views = MergedViews(merged, members, segmentation, len(features), networks)
-    return decode_merged(views, scene, plan.decode, grows=plan.fit.grows)
+    return decode_merged(views, scene, plan.merge.decode, grows=plan.fit.grows)
 
 
-def encode_groups(scene: PicturedScene, groups: Groups, plan: Plan) -> tuple[FeatureGaussians, Members, Corrector]:
+def encode_groups(
+    scene: PicturedScene, groups: Groups, plan: MergePlan, seed: int
+) -> tuple[FeatureGaussians, Members, Corrector]:
     """Encode each superpixel of all views as a Feature Gaussian; also return its members, and the networks."""
     members = assign(scene, groups, by_contribution=plan.by_contribution)
     networks: Corrector = ANALYTIC  # changes nothing
     if plan.networks is not None:
         from gsmerge.networks.apply import NetworkContext
 
-        networks = NetworkContext(plan.networks, members, scene.cameras, plan.seed)
+        networks = NetworkContext(plan.networks, members, scene.cameras, seed)
     features = encode(scene, members, groups)
     return correct(features, members, scene.cameras, networks, weaken=plan.weakens), members, networks

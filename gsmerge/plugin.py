@@ -4,7 +4,7 @@
 
 - ``Method``: a method of compacting a scene, which an entry point of the group ``gsmerge.methods`` names
 - ``Prepared``: a scene in its canonical frame, with ``scene``, ``reference``, ``frame`` and what was done to it
-- ``Plan``: the decisions of a run, such as ``limits``, ``fit`` and ``seed``
+- ``Plan``: the decisions of a run, with ``count``, ``merge``, ``fit``, ``score`` and ``seed``
 - ``prepare``: what prepares a scene for a method; ``without`` names the steps that it leaves out
 - ``stage``: a block of a method whose seconds a run reports; ``note``: a sentence for its report
 - ``GsmergeError``, ``SceneError``, ``UsageError``: end a command with one line and an exit code

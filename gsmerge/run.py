@@ -202,7 +202,7 @@ def plan_run(scene: Scene, options: CompactOptions) -> tuple[Prepared, Plan]:
 
 def compact_prepared(prepared: Prepared, plan: Plan) -> CompactResult:
     """Build the Gaussians of a prepared scene as the plan says, in one piece, and score them."""
-    if plan.keeps_fidelity or prepared.reference.name == RENDERS:
+    if plan.count.keeps_fidelity or prepared.reference.name == RENDERS:
         from gsmerge.special.search import add_target
 
         plan = add_target(plan, prepared)
@@ -214,14 +214,14 @@ def compact_prepared(prepared: Prepared, plan: Plan) -> CompactResult:
         best = search_count(prepared, plan)
     else:
         begin_part("build")
-        best = score(build(prepared, plan, plan.limits.count), prepared, plan)
-    if plan.levels > 1:
+        best = score(build(prepared, plan, plan.count.limits.count), prepared, plan)
+    if plan.count.levels > 1:
         from gsmerge.special.search import build_levels
 
         levels = build_levels(best, prepared, plan)
     begin_part("input")
     result = make_result(best, levels, prepared, plan)
-    if plan.new_views:
+    if plan.score.new_views:
         from gsmerge.special.new_views import expect_new_views
 
         result = replace(result, report=expect_new_views(result.report, prepared, plan))

@@ -116,11 +116,11 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
     if (options.budget.auto or options.budget.is_limit) and scene.has_own_pixels:
         options = resolve_budget(size, options, confirm_depths(canonicalise(scene)[0]))
     plan, num_blocks = plan_scene(size, options), choose_blocks(size, options)
-    limits, settings = plan.limits, plan.settings
+    limits, settings = plan.count.limits, plan.settings
     num_pixels = max(limits.num_pixels, scene.num_gaussians)
     max_count = num_pixels if options.method.startswith("unmerged") else limits.count or limits.default
     no_views = is_without_views(scene, options)
-    has_target = plan.keeps_fidelity or options.budget.target_psnr is not None
+    has_target = plan.count.keeps_fidelity or options.budget.target_psnr is not None
     found_count = None
     if no_views and has_target and num_input <= MAX_SEARCHED_GAUSSIANS:  # estimates find it by the search of a run
         with use_threads(options.threads), record_part(silent=True):
@@ -148,9 +148,9 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
     return {
         "num_gaussians": count,
         "exact": options.budget.is_filled or found_count is not None,
-        "psnr_kept": FIDELITY_PSNR if plan.keeps_fidelity and size.rendered and found_count is None else None,
+        "psnr_kept": FIDELITY_PSNR if plan.count.keeps_fidelity and size.rendered and found_count is None else None,
         "quality": options.budget.quality if found_count is None else None,
-        "loss_kept": FIDELITY_LOSS if plan.keeps_fidelity and not size.rendered else None,
+        "loss_kept": FIDELITY_LOSS if plan.count.keeps_fidelity and not size.rendered else None,
         "ratio": count / max(1, num_input),
         "bytes": file_bytes(count, scene.gaussians.sh_degree),
         "blocks": num_blocks,

@@ -25,10 +25,10 @@ def run_parts(prepared: Prepared, plan: Plan) -> list[RunPart]:
     """Return the parts that a run in one piece is expected to have, in their order, after the fits of a curve."""
     views, steps = len(prepared.scene), 0 if plan.fit.fit == "none" else plan.fit.steps
     build = RunPart("build", STAGE_STEPS * views, steps)
-    count = usual_builds(has_target=plan.target_psnr is not None, rendered=prepared.reference.name == RENDERS)
+    count = usual_builds(has_target=plan.count.target_psnr is not None, rendered=prepared.reference.name == RENDERS)
     trial = RunPart("trial", TRIAL_SHARE * build.stages, TRIAL_SHARE * steps)
-    shares = [1.0] * count + [LEVEL_SHARE**level for level in range(1, plan.levels)]
+    shares = [1.0] * count + [LEVEL_SHARE**level for level in range(1, plan.count.levels)]
     return [
         *(RunPart("build", share * build.stages, share * steps) for share in shares),
-        RunPart("input", INPUT_STEPS * views), *([trial] if plan.new_views else []),
+        RunPart("input", INPUT_STEPS * views), *([trial] if plan.score.new_views else []),
     ]  # fmt: skip

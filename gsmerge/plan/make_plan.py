@@ -25,7 +25,7 @@ from gsmerge.plan.counts import (
 from gsmerge.plan.efforts import EFFORTS
 from gsmerge.plan.fit import SHORT_STEPS, fit_to_pictures, resolve_fit
 from gsmerge.plan.networks import choose_networks, cuts_views, load_networks
-from gsmerge.plan.plan import Plan
+from gsmerge.plan.plan import CountPlan, MergePlan, Plan, ScorePlan
 from gsmerge.prepare.prepared import Prepared
 from gsmerge.prepare.row_colors import RENDERS
 from gsmerge.prepare.scene_size import SceneSize
@@ -68,11 +68,11 @@ def make_plan(
         plan = plan_scene(size, filled, num_input=num_input, keeps=keeps_fidelity(size, options))
         merges_pairs = plan.merges_pairs and checkpoint is None
         fit = fit_to_pictures(prepared, filled, plan.fit, merges_pairs=merges_pairs)
-        if plan.keeps_fidelity and has_few_rows(size):
+        if plan.count.keeps_fidelity and has_few_rows(size):
             few = f"the scene has only {size.num_gaussians:,} Gaussians, fewer than its photos need"
             note(f"{few}; the result has at most half of them, and more may show the photos better: --budget NUMBER")
         # a quality that the user asks for is measured on all pixels, and small views have too few tiles for a sample
-        samples = plan.target_psnr is None and not plan.keeps_fidelity
+        samples = plan.count.target_psnr is None and not plan.count.keeps_fidelity
         samples = samples and scored_tiles(0, cameras.width, cameras.height, 2) is not None
         # Views among those whose pictures show the scene. The effort decides how many a report needs; scores that
         # decide the number of Gaussians take more. All views that were placed count
@@ -82,25 +82,24 @@ def make_plan(
             chosen = pick_views(num_views, report_views) if samples else scored_views(num_views)
             scored = tuple(scored[i] for i in chosen)
         # all builds of a run share one tree of regions, by which they cut the views
-        has_tree = plan.has_quality or plan.levels > 1 or plan.limits.count is not None
+        has_tree = plan.count.has_quality or plan.count.levels > 1 or plan.count.limits.count is not None
         has_tree = has_tree and cuts_views(options, size) and not merges_pairs
-        plan = replace(
-            plan,
-            superpixels=replace(plan.superpixels, shared=SharedTree() if has_tree else None),
-            fit=fit,
-            merges_pairs=merges_pairs,
-            file_size=file_size(budget),
-            scored_views=scored,
-            samples=samples,
-            checkpoint=checkpoint,
-            settings=replace(options, decode=plan.decode).to_dict() | {"fit_steps": fit.steps},
-            run=run,
-            new_views=plan.new_views and prepared.agreement is not None and prepared.can_leave_out,
-        )
+        superpixels = replace(plan.merge.superpixels, shared=SharedTree() if has_tree else None)
+        merge = replace(plan.merge, superpixels=superpixels, checkpoint=checkpoint)
         if merges_pairs:
-            count = plan.limits.count or plan.limits.default
-            plan = replace(plan, power=choose_power(count, prepared, fit, plan.seed))
-    return plan
+            count = plan.count.limits.count or plan.count.limits.default
+            merge = replace(merge, power=choose_power(count, prepared, fit, plan.seed))
+        new_views = plan.score.new_views and prepared.agreement is not None and prepared.can_leave_out
+        return replace(
+            plan,
+            count=replace(plan.count, file_size=file_size(budget)),
+            merge=merge,
+            fit=fit,
+            score=replace(plan.score, views=scored, samples=samples, new_views=new_views),
+            merges_pairs=merges_pairs,
+            settings=replace(options, decode=plan.merge.decode).to_dict() | {"fit_steps": fit.steps},
+            run=run,
+        )
 
 
 def plan_scene(
@@ -133,22 +132,26 @@ def plan_scene(
     # Without a fit, new views look as good as the views of the input, so they need no estimate
     new_views = fit.fit != "none" and options.effort != "draft" if options.new_views is None else options.new_views
     return Plan(
-        superpixels=SuperpixelChoices(segment, limits, start_share(fit), None),
-        match=replace(options.match, match=match),
-        decode=decode,
+        count=CountPlan(
+            limits=limits,
+            target_psnr=FIDELITY_PSNR if keeps and size.rendered else budget.target_psnr,
+            keeps_fidelity=keeps,
+            max_drop=budget.max_drop,
+            auto_count=budget.auto,
+            levels=budget.levels,
+        ),
+        merge=MergePlan(
+            superpixels=SuperpixelChoices(segment, start_share(fit)),
+            match=replace(options.match, match=match),
+            decode=decode,
+        ),
         fit=fit,
-        merges_pairs=options.method == OURS and networks == "none" and not cuts,
+        score=ScorePlan(output=budget.output, new_views=new_views),
         clean=options.clean,
-        target_psnr=FIDELITY_PSNR if keeps and size.rendered else budget.target_psnr,
-        keeps_fidelity=keeps,
-        max_drop=budget.max_drop,
-        auto_count=budget.auto,
-        levels=budget.levels,
-        output=budget.output,
+        merges_pairs=options.method == OURS and networks == "none" and not cuts,
         seed=options.seed,
         settings=options.to_dict() | {"k": decode.k, "match": match, "checkpoint": networks},
         free_poses=options.prepare.poses == "free",
-        new_views=new_views,
     )
 
 

@@ -1,4 +1,8 @@
-"""A plan: all decisions about a run, made before the first superpixel is cut; each stage takes its own part."""
+"""A plan: all decisions about a run, made before the first superpixel is cut.
+
+It has four parts: how many Gaussians, how they are merged, how they are fitted, and what is scored. Each stage takes
+its own part.
+"""
 
 from __future__ import annotations
 
@@ -24,37 +28,32 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
-    """All decisions about a run, made before the first superpixel is cut."""
+class CountPlan:
+    """How many Gaussians a result has."""
 
-    superpixels: SuperpixelChoices  # How each view is cut, and into how many
-    match: MatchOptions  # Merging across views
-    decode: DecodeOptions  # Gaussians per group
-    fit: FitOptions  # Fit to the photos
-    merges_pairs: bool  # Merge neighbours pair by pair instead of superpixels
-    clean: CleanOptions  # What is left out of the result
+    limits: CountLimits  # Limits of the number of Gaussians
     target_psnr: float | None  # PSNR (dB) that the result has to reach; None: no target, or not known yet
-    keeps_fidelity: bool  # See :func:`keeps_fidelity`
+    keeps_fidelity: bool  # See :func:`gsmerge.plan.counts.keeps_fidelity`
     max_drop: float | None  # Allowed loss in dB against the best of the curve; None: no target
     auto_count: bool  # The scene's own curve decides the number of Gaussians
     levels: int  # Levels of detail
-    output: str  # Name of the output's file, whose format may round values; "": no file
-    seed: int  # All random choices depend on this number alone
-    settings: dict[str, Any]  # All settings by flat name, for reports
-    scored_views: tuple[int, ...] = ()  # Ids of the views in which input and result are scored
-    checkpoint: Checkpoint | None = None  # Networks, from a file; None: closed formulas alone
     file_size: FileSize | None = None  # Largest size of the output's file; None: any
+
+    @property
+    def has_quality(self) -> bool:
+        """Return whether a quality or the scene's curve decides the number of Gaussians."""
+        return self.target_psnr is not None or self.max_drop is not None or self.auto_count or self.keeps_fidelity
+
+
+@dataclass(frozen=True, eq=False)
+class MergePlan:
+    """How views are cut into superpixels, merged, and decoded."""
+
+    superpixels: SuperpixelChoices  # How each view is cut
+    match: MatchOptions  # Merging across views
+    decode: DecodeOptions  # Gaussians per group
+    checkpoint: Checkpoint | None = None  # Networks, from a file; None: closed formulas alone
     power: float = POWERS[0]  # Power of the masses by which pairs are merged
-    free_poses: bool = False  # The options ask the fit to move cameras, even if the scene does not need it
-    samples: bool = False  # Only a sample of the pixels is scored, because only the report needs the scores
-    new_views: bool = False  # Estimate the quality of new views
-    # How another package builds a number of Gaussians; None: gsmerge's own stages build them
-    run: Callable[[Prepared, Plan, int], Gaussians] | None = None
-    is_trial: bool = False  # The result is only scored on left-out photos, so gaps need not be filled
-    before: PhotoScore | None = None  # Score of the input, if the result has to keep its quality on photos
-    # [h,w] bool for each scored view: the pixels that the input covers, if it leaves gaps and its renders stand for
-    # photos
-    covered: tuple[np.ndarray, ...] | None = None
 
     @property
     def networks(self) -> NetworkWeights | None:
@@ -79,25 +78,48 @@ class Plan:
         """
         return self.superpixels.start_share < 1 and self.checkpoint is None
 
+
+@dataclass(frozen=True, eq=False)
+class ScorePlan:
+    """In which views, and over which pixels, the input and its results are scored."""
+
+    output: str  # Name of the output's file, whose format may round values; "": no file
+    new_views: bool  # Estimate the quality of new views
+    views: tuple[int, ...] = ()  # Ids of the views in which input and result are scored
+    samples: bool = False  # Only a sample of the pixels is scored, because only the report needs the scores
+    before: PhotoScore | None = None  # Score of the input, if the result has to keep its quality on photos
+    # [h,w] bool for each scored view: the pixels that the input covers, if it leaves gaps and its renders stand for
+    # photos
+    covered: tuple[np.ndarray, ...] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """All decisions about a run, made before the first superpixel is cut."""
+
+    count: CountPlan  # How many Gaussians
+    merge: MergePlan  # How they are made
+    fit: FitOptions  # How they are fitted to the photos
+    score: ScorePlan  # How results are scored
+    clean: CleanOptions  # What is left out of the result
+    merges_pairs: bool  # Merge neighbours pair by pair instead of superpixels
+    seed: int  # All random choices depend on this number alone
+    settings: dict[str, Any]  # All settings by flat name, for reports
+    free_poses: bool = False  # The options ask the fit to move cameras, even if the scene does not need it
+    # How another package builds a number of Gaussians; None: gsmerge's own stages build them
+    run: Callable[[Prepared, Plan, int], Gaussians] | None = None
+    is_trial: bool = False  # The result is only scored on left-out photos, so gaps need not be filled
+
     @property
     def prunes(self) -> bool:
         """Return whether Gaussians that no photo shows are dropped after the fit."""
         return self.fit.min_contribution > 0
 
     @property
-    def has_quality(self) -> bool:
-        """Return whether a quality or the scene's curve decides the number of Gaussians."""
-        return self.target_psnr is not None or self.max_drop is not None or self.auto_count or self.keeps_fidelity
-
-    @property
     def searches(self) -> bool:
         """Return whether several counts may be built: for a quality, for the file's size, or to clean up a result."""
-        return self.has_quality or (self.file_size is not None and self.file_size.packed) or self.clean.asked
-
-    @property
-    def limits(self) -> CountLimits:
-        """Limits of the number of Gaussians."""
-        return self.superpixels.limits
+        size = self.count.file_size
+        return self.count.has_quality or (size is not None and size.packed) or self.clean.asked
 
     def with_fixed_cameras(self) -> Plan:
         """Return the plan with a fit that does not move cameras."""
@@ -105,4 +127,5 @@ class Plan:
 
     def with_fit(self, fit: FitOptions) -> Plan:
         """Return the plan with the fit ``fit``, which starts with all Gaussians."""
-        return replace(self, fit=fit, superpixels=replace(self.superpixels, start_share=1.0))
+        superpixels = replace(self.merge.superpixels, start_share=1.0)
+        return replace(self, fit=fit, merge=replace(self.merge, superpixels=superpixels))

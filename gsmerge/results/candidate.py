@@ -7,7 +7,7 @@ from gsmerge.frozen import dataclass, replace
 from gsmerge.geometry.frame import scene_depth
 from gsmerge.io.cameras.camera_file import describe_moves, list_moves
 from gsmerge.plan.make_plan import own_views
-from gsmerge.plan.plan import Plan
+from gsmerge.plan.plan import Plan, ScorePlan
 from gsmerge.prepare.prepared import Prepared
 from gsmerge.prepare.row_colors import RENDERS
 from gsmerge.results.scores import compares_all_pixels, measure_renders, measure_result, round_for_output
@@ -41,19 +41,20 @@ def score(fitted: Fitted, prepared: Prepared, plan: Plan, count: int | None = No
         moves = list_moves(input_scene.names, input_scene.cameras.viewmats, cameras.viewmats, depth)
         record_choices(poses=moves)
         note(f"{cause}: cameras were moved by {describe_moves(moves)}")
-    psnr, deciding_psnr = _measure_candidate(gaussians, moved, plan)
+    psnr, deciding_psnr = _measure_candidate(gaussians, moved, plan.score)
     return Candidate(count, fitted, gaussians, cameras, psnr, current_record(), deciding_psnr)
 
 
 def rescore(candidate: Candidate, gaussians: Gaussians, prepared: Prepared, plan: Plan) -> Candidate:
     """Return the candidate with only ``gaussians``, which are some or all of its Gaussians, and with their PSNR."""
     with record_part(silent=True) as record:
-        psnr, _ = _measure_candidate(gaussians, with_moved_views(prepared, candidate.fitted.cameras), plan)
+        moved = with_moved_views(prepared, candidate.fitted.cameras)
+        psnr, _ = _measure_candidate(gaussians, moved, plan.score)
     candidate.record.choices.update(record.choices)
     return replace(candidate, gaussians=gaussians, psnr=psnr)
 
 
-def _measure_candidate(gaussians: Gaussians, moved: Prepared, plan: Plan) -> tuple[float | None, float | None]:
+def _measure_candidate(gaussians: Gaussians, moved: Prepared, plan: ScorePlan) -> tuple[float | None, float | None]:
     """Return ``psnr`` and ``deciding_psnr`` of a candidate with ``gaussians``, which are in the world frame.
 
     Both PSNR are measured against photos, or against renders of the input if the renders stand for photos. Both PSNR
@@ -65,15 +66,13 @@ def _measure_candidate(gaussians: Gaussians, moved: Prepared, plan: Plan) -> tup
             compared = measure_renders(canonical, moved, plan)
         # If the input leaves gaps, only the pixels that it covers count
         fidelity = compared.psnr if plan.covered is None else compared.covered_psnr
-        views, placed = len(plan.scored_views), moved.reference.placed
+        views, placed = len(plan.views), moved.reference.placed
         record_choices(fidelity={"psnr": fidelity, "views": views, "held_out": placed})
         return fidelity, fidelity
     measured = measure_result(gaussians, moved, plan, None if plan.before is None else plan.before.covered)
     if measured is None:
         return None, None
-    record_choices(
-        scored_views=len(plan.scored_views), scored_all=not plan.samples and plan.scored_views == own_views(moved)
-    )
+    record_choices(scored_views=len(plan.views), scored_all=not plan.samples and plan.views == own_views(moved))
     return measured.psnr, measured.psnr if compares_all_pixels(plan.before) else measured.covered_psnr
 
 

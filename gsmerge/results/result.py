@@ -145,17 +145,19 @@ def make_result(best: Candidate, levels: Sequence[Candidate], prepared: Prepared
     the photos. If a sample shows that a result may be worse than the input, this function starts again with all photos.
     The report contains the seconds, choices and notes of the current record, and those of a level its own.
     """
-    input_scores, candidates = score_input(prepared, plan), (best, *levels)
+    input_scores, candidates = score_input(prepared, plan.score), (best, *levels)
     before = None if input_scores.photos is None else input_scores.photos.psnr
     part_scores = [
-        measure_parts(input_scores, candidate.gaussians, with_moved_views(prepared, candidate.fitted.cameras), plan)
+        measure_parts(
+            input_scores, candidate.gaussians, with_moved_views(prepared, candidate.fitted.cameras), plan.score
+        )
         for candidate in candidates
     ]
-    if plan.samples and any(
+    if plan.score.samples and any(
         is_worse(*compared_psnr(parts.covered, before, candidate.psnr), SAMPLE_LOSS)
         for parts, candidate in zip(part_scores, candidates, strict=True)
     ):
-        plan = replace(plan, scored_views=own_views(prepared), samples=False)
+        plan = replace(plan, score=replace(plan.score, views=own_views(prepared), samples=False))
         best, *levels = (rescore(candidate, candidate.gaussians, prepared, plan) for candidate in candidates)
         return make_result(best, levels, prepared, plan)
     seconds = dict(best.record.seconds)

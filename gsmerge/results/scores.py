@@ -10,7 +10,7 @@ import numpy as np
 from gsmerge.frozen import dataclass, replace
 from gsmerge.geometry.views import scored_views
 from gsmerge.io.formats.write import round_as_written
-from gsmerge.plan.plan import Plan
+from gsmerge.plan.plan import ScorePlan
 from gsmerge.prepare.prepared import Prepared
 from gsmerge.raster.photos import NEAR_PLANE, WHOLE_SHARE, PhotoScore, scene_photos, score_photos
 from gsmerge.results.report import Covered, PhotoFiles
@@ -33,24 +33,24 @@ def compares_all_pixels(before: PhotoScore | None) -> bool:
     return before is None or before.share >= WHOLE_SHARE or not math.isfinite(before.covered_psnr)
 
 
-def measure_renders(gaussians: Gaussians, prepared: Prepared, plan: Plan) -> PhotoScore:
+def measure_renders(gaussians: Gaussians, prepared: Prepared, plan: ScorePlan) -> PhotoScore:
     """Score canonical Gaussians against renders of the input in the scored views."""
-    return score_photos(gaussians, scene_photos(prepared.scene), plan.scored_views, covered=plan.covered)
+    return score_photos(gaussians, scene_photos(prepared.scene), plan.views, covered=plan.covered)
 
 
-def may_leave_gaps(prepared: Prepared, plan: Plan) -> bool:
+def may_leave_gaps(prepared: Prepared, plan: ScorePlan) -> bool:
     """Return whether the input may leave gaps, because more than a few pixels are black in its renders."""
-    pictures = (prepared.scene.images[view] for view in plan.scored_views)
+    pictures = (prepared.scene.images[view] for view in plan.views)
     return bool(np.mean([(picture.max(-1) > ROUNDING).mean() for picture in pictures]) < WHOLE_SHARE)
 
 
-def round_for_output(gaussians: Gaussians, plan: Plan) -> Gaussians:
+def round_for_output(gaussians: Gaussians, plan: ScorePlan) -> Gaussians:
     """Round the values of Gaussians as the output file does; return the Gaussians unchanged if no file is written."""
     return round_as_written(plan.output, gaussians) if plan.output else gaussians
 
 
 def measure_result(
-    gaussians: Gaussians, prepared: Prepared, plan: Plan, covered: Sequence[np.ndarray] | None = None
+    gaussians: Gaussians, prepared: Prepared, plan: ScorePlan, covered: Sequence[np.ndarray] | None = None
 ) -> PhotoScore | None:
     """Score Gaussians of the world, as the output file rounds them, on the scored photos; None without photos.
 
@@ -63,7 +63,7 @@ def measure_result(
     return _score_photos("score", round_for_output(gaussians, plan), views, prepared, plan, covered, every)
 
 
-def measure_input(prepared: Prepared, plan: Plan) -> PhotoScore | None:
+def measure_input(prepared: Prepared, plan: ScorePlan) -> PhotoScore | None:
     """Score the Gaussians of the input on the scored photos, and over the pixels that they cover; None without photos.
 
     If each Gaussian comes from one view, the covered pixels are the pixels that have a Gaussian.
@@ -73,7 +73,7 @@ def measure_input(prepared: Prepared, plan: Plan) -> PhotoScore | None:
     views = prepared.input_scene
     if prepared.scene.empty is not None:  # where a result may show nothing, the input is not scored either
         views = replace(views, masks=prepared.result_views().masks)
-    covered = None if views.covered is None else list(views.covered[list(plan.scored_views)])
+    covered = None if views.covered is None else list(views.covered[list(plan.views)])
     return _score_photos("input", views.file_gaussians, views, prepared, plan, covered)
 
 
@@ -82,7 +82,7 @@ def _score_photos(
     gaussians: Gaussians,
     views: Scene,
     prepared: Prepared,
-    plan: Plan,
+    plan: ScorePlan,
     covered: Sequence[np.ndarray] | None,
     every: int = INPUT_EVERY,
 ) -> PhotoScore:
@@ -92,10 +92,10 @@ def _score_photos(
     """
     with stage(name):
         near, every, photos = NEAR_PLANE * prepared.frame.unit, every if plan.samples else 1, scene_photos(views)
-        return score_photos(gaussians, photos, plan.scored_views, every=every, near=near, covered=covered)
+        return score_photos(gaussians, photos, plan.views, every=every, near=near, covered=covered)
 
 
-def _measure_on_files(gaussians: Gaussians, prepared: Prepared, plan: Plan) -> float | None:
+def _measure_on_files(gaussians: Gaussians, prepared: Prepared, plan: ScorePlan) -> float | None:
     """Return the PSNR (dB) of Gaussians of the world on the photos as they are in their files.
 
     None if the run changed no scored photo.
@@ -104,12 +104,12 @@ def _measure_on_files(gaussians: Gaussians, prepared: Prepared, plan: Plan) -> f
     if photos is None:
         return None
     views = prepared.result_views()
-    if views.images is None or all(np.array_equal(views.images[view], photos[view]) for view in plan.scored_views):
+    if views.images is None or all(np.array_equal(views.images[view], photos[view]) for view in plan.views):
         return None
     return _score_photos("score", gaussians, replace(views, images=photos), prepared, plan, None).psnr
 
 
-def _measure_protected(gaussians: Gaussians, prepared: Prepared, plan: Plan) -> PhotoScore | None:
+def _measure_protected(gaussians: Gaussians, prepared: Prepared, plan: ScorePlan) -> PhotoScore | None:
     """Score Gaussians of the world over the protected pixels, in views that have some; None if no view has any.
 
     ``share`` of the score is the share of protected pixels in all photos.
@@ -135,7 +135,7 @@ class InputScores:
     protected: PhotoScore | None  # Over protected pixels
 
 
-def score_input(prepared: Prepared, plan: Plan) -> InputScores:
+def score_input(prepared: Prepared, plan: ScorePlan) -> InputScores:
     """Score the Gaussians of the input. The plan may already have the score on the scored photos."""
     photos, gaussians = plan.before or measure_input(prepared, plan), prepared.input_scene.file_gaussians
     return InputScores(
@@ -156,7 +156,7 @@ class PartScores:
     protected: Covered | None = None
 
 
-def measure_parts(before: InputScores, gaussians: Gaussians, prepared: Prepared, plan: Plan) -> PartScores:
+def measure_parts(before: InputScores, gaussians: Gaussians, prepared: Prepared, plan: ScorePlan) -> PartScores:
     """Score a result over covered and over protected pixels, and on the photos as they are in their files.
 
     ``before`` has the scores of the input, which are returned together with the scores of the result.

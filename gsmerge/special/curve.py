@@ -77,7 +77,8 @@ def measure_curve(
         seen = np.flatnonzero(left_out.shares > LEAST_SEEN).tolist()
         photos, weights = left_out.photos[seen], [1 - mask.astype(np.float32) for mask in left_out.seen[seen]]
         prepared, plan, min_gain = left_out.rest, left_out.plan(plan), math.inf
-    short_plan = replace(plan.with_fit(short), checkpoint=None)
+    short_plan = plan.with_fit(short)
+    short_plan = replace(short_plan, merge=replace(short_plan.merge, checkpoint=None))
     points: list[CurvePoint] = []
     report_progress(PROGRESS, 0, len(counts))
     for count in counts:

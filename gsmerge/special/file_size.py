@@ -39,8 +39,8 @@ def meet_bytes(candidate: Candidate, prepared: Prepared, plan: Plan) -> Candidat
     The candidate is rebuilt with other counts until its file is about as large as allowed. The faintest Gaussians of
     the last build are dropped until the file fits.
     """
-    assert plan.file_size is not None, "a budget in bytes"
-    max_bytes, file = plan.file_size.num_bytes, plan.file_size.file
+    assert plan.count.file_size is not None, "a budget in bytes"
+    max_bytes, file = plan.count.file_size.num_bytes, plan.count.file_size.file
     names = prepared.input_scene.names
     base_bytes = measure_least_bytes(candidate.gaussians, max_bytes, file, candidate.cameras, names)
 
@@ -49,7 +49,7 @@ def meet_bytes(candidate: Candidate, prepared: Prepared, plan: Plan) -> Candidat
         last, count = built[-1], len(built[-1].gaussians)
         num_bytes = measure_bytes(last.gaussians, file, last.cameras, names)
         expected_count = int(BUILD_SURPLUS * count * (max_bytes - base_bytes) / max(num_bytes - base_bytes, 1))
-        next_count = min(expected_count, plan.limits.most)
+        next_count = min(expected_count, plan.count.limits.most)
         # Gaussians that no view sees were dropped from the requested number, and no other Gaussians take their place
         requested_count = max(count, last.count or 0)
         requested_bytes = base_bytes + (num_bytes - base_bytes) * requested_count / max(count, 1)

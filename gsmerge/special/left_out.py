@@ -58,8 +58,8 @@ class LeftOut:
         """
         settings = plan.settings | TRIAL | settings
         # without networks in the plan, the settings must not ask for any
-        settings |= {"method": OURS, "checkpoint": "none"} if plan.checkpoint is None else {}
-        return make_plan(self.rest, CompactOptions().with_settings(settings), plan.checkpoint, plan.run)
+        settings |= {"method": OURS, "checkpoint": "none"} if plan.merge.checkpoint is None else {}
+        return make_plan(self.rest, CompactOptions().with_settings(settings), plan.merge.checkpoint, plan.run)
 
 
 def leave_out(scene: PicturedScene, views: Sequence[int], prepared: Prepared) -> LeftOut | None:

@@ -10,7 +10,7 @@ from gsmerge.kernels.elementary import exp, log, power
 from gsmerge.pipeline import build
 from gsmerge.plan.counts import FIDELITY_LOSS, level_counts
 from gsmerge.plan.forecast import STAGE_STEPS, run_parts
-from gsmerge.plan.plan import Plan
+from gsmerge.plan.plan import CountPlan, Plan
 from gsmerge.prepare.prepared import LEAST_VIEWS, Prepared
 from gsmerge.prepare.row_colors import PHOTOS, RENDERS
 from gsmerge.results.candidate import Candidate, score
@@ -59,12 +59,12 @@ def search_count(prepared: Prepared, plan: Plan) -> Candidate:
     The count is the one at which a PSNR is reached, or the one that the scene's curve or a size of the file allows.
     Seconds, choices and notes of the search, and of the result, are recorded.
     """
-    if plan.target_psnr is not None:
+    if plan.count.target_psnr is not None:
         best = _reach_target(prepared, plan)
     else:
         best = build_candidate(prepared, plan, choose_count(prepared, plan))
         add_seconds(best.record.seconds)
-    if plan.file_size is not None and plan.file_size.packed:
+    if plan.count.file_size is not None and plan.count.file_size.packed:
         best = meet_bytes(best, prepared, plan)
     adopt(best.record)
     return replace(best, record=current_record())
@@ -78,7 +78,7 @@ def _reach_target(prepared: Prepared, plan: Plan) -> Candidate:
     errors.
     """
     left_out = leave_out_for_scores(prepared, plan)
-    is_cleaned_last = plan.keeps_fidelity and plan.clean.asked and left_out is None
+    is_cleaned_last = plan.count.keeps_fidelity and plan.clean.asked and left_out is None
     tried_plan = plan if left_out is None else left_out.plan(plan)
     if is_cleaned_last:
         tried_plan = replace(plan, clean=CleanOptions())
@@ -98,9 +98,9 @@ def _reach_target(prepared: Prepared, plan: Plan) -> Candidate:
         add_seconds(candidate.record.seconds)
         return candidate.deciding_psnr or 0.0
 
-    limits, most = plan.limits, most_useful(prepared, plan, left_out)
+    limits, most = plan.count.limits, most_useful(prepared, plan, left_out)
     first = min(max(limits.default, limits.min_count), most)
-    search = CountSearch(plan, first, prepared.reference.name == RENDERS, left_out, most)
+    search = CountSearch(plan.count, first, prepared.reference.name == RENDERS, left_out, most)
     search.run(measure)
     if left_out is not None:
         best = build_candidate(prepared, plan, search.count)
@@ -123,13 +123,13 @@ def _reach_target(prepared: Prepared, plan: Plan) -> Candidate:
 def build_levels(best: Candidate, prepared: Prepared, plan: Plan) -> list[Candidate]:
     """Build the coarser levels of detail of a result, which keep the cameras that the result has."""
     prepared, plan = prepared.with_cameras(best.fitted.cameras), plan.with_fixed_cameras()
-    counts = level_counts(len(best.gaussians), plan.levels, plan.limits.min_count)
+    counts = level_counts(len(best.gaussians), plan.count.levels, plan.count.limits.min_count)
     return [build_candidate(prepared, plan, count) for count in counts]
 
 
 def most_useful(prepared: Prepared, plan: Plan, left_out: LeftOut | None) -> int:
     """Return the largest count of a search, above which left-out photos gain nothing."""
-    limits, agreement = plan.limits, prepared.agreement
+    limits, agreement = plan.count.limits, prepared.agreement
     if left_out is None or agreement is None:
         return limits.max_count
     return max(limits.min_count, min(limits.max_count, int(agreement.share * limits.num_pixels)))
@@ -139,7 +139,7 @@ def most_useful(prepared: Prepared, plan: Plan, left_out: LeftOut | None) -> int
 class CountSearch:
     """Search for the number of Gaussians at which a PSNR is reached, by building one count after another."""
 
-    plan: Plan  # Has the target and the limits
+    plan: CountPlan  # Has the target and the limits
     first: int  # The first count to build
     rendered: bool = False  # Results are scored on renders of the input, which more Gaussians always show better
     left_out: LeftOut | None = None  # Photos for scores, which the fits leave out; None: all views score
@@ -251,15 +251,20 @@ def add_target(plan: Plan, prepared: Prepared) -> Plan:
     allowed loss. If renders of the input stand for photos, only the pixels that the input covers count. In gaps, where
     input and result are both black, any result would look perfect.
     """
-    if prepared.reference.name == RENDERS and may_leave_gaps(prepared, plan):
-        input_score = measure_renders(prepared.scene.gaussians, prepared, plan)
-        plan = plan if compares_all_pixels(input_score) else replace(plan, covered=input_score.covered)
-    if not plan.keeps_fidelity or plan.target_psnr is not None:
+    if prepared.reference.name == RENDERS and may_leave_gaps(prepared, plan.score):
+        input_score = measure_renders(prepared.scene.gaussians, prepared, plan.score)
+        plan = (
+            plan
+            if compares_all_pixels(input_score)
+            else replace(plan, score=replace(plan.score, covered=input_score.covered))
+        )
+    if not plan.count.keeps_fidelity or plan.count.target_psnr is not None:
         return plan
-    before = measure_input(prepared, plan)
+    before = measure_input(prepared, plan.score)
     assert before is not None, "a scene with photos"
     psnr = before.psnr if compares_all_pixels(before) else before.covered_psnr
-    return replace(plan, before=before, target_psnr=psnr - FIDELITY_LOSS)
+    count = replace(plan.count, target_psnr=psnr - FIDELITY_LOSS)
+    return replace(plan, count=count, score=replace(plan.score, before=before))
 
 
 def leave_out_for_scores(prepared: Prepared, plan: Plan) -> LeftOut | None:
@@ -268,14 +273,14 @@ def leave_out_for_scores(prepared: Prepared, plan: Plan) -> LeftOut | None:
     Views are left out if a quality target or the curve decides the count, because a fit shows new photos worse than the
     photos that it has seen. No view is left out without a fit, or if candidates only have to be as good as the input.
     """
-    has_target = plan.target_psnr is not None and not plan.keeps_fidelity
-    if plan.fit.fit == "none" or not (has_target or plan.max_drop is not None or plan.auto_count):
+    has_target = plan.count.target_psnr is not None and not plan.count.keeps_fidelity
+    if plan.fit.fit == "none" or not (has_target or plan.count.max_drop is not None or plan.count.auto_count):
         return None
     if prepared.can_leave_out:
         for views in choose_left_out(prepared.reference.score_views):
             if left_out := leave_out(prepared.scene, views, prepared):
                 return left_out
-    if prepared.reference.name == PHOTOS and not plan.auto_count:
+    if prepared.reference.name == PHOTOS and not plan.count.auto_count:
         reason = f"there are fewer than {LEAST_VIEWS} photos, or no other view sees what they show"
         if not prepared.scene.has_own_pixels:
             reason = "views have no Gaussians of their own, which could be left out with the photos"
@@ -289,11 +294,11 @@ def choose_count(prepared: Prepared, plan: Plan) -> int | None:
 
     The curve is measured on left-out photos or, without them, on patches of all photos.
     """
-    limits, drop, left_out = plan.limits, plan.max_drop, leave_out_for_scores(prepared, plan)
-    if drop is None and not plan.auto_count:
+    limits, drop, left_out = plan.count.limits, plan.count.max_drop, leave_out_for_scores(prepared, plan)
+    if drop is None and not plan.count.auto_count:
         return limits.count
     if prepared.reference.name == RENDERS:
-        return knee_count(prepared.scene, plan.superpixels)
+        return knee_count(prepared.scene, plan.merge.superpixels, plan.count.limits)
     with stage("curve"):
         counts, steps = curve_counts(drop, limits.default, limits.min_count, most_useful(prepared, plan, left_out))
         curve_part = RunPart("curve", STAGE_STEPS * len(prepared.scene), steps)

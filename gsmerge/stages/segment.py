@@ -43,12 +43,11 @@ KNEE_FLOOR = 3e-4  # squared error per pixel and channel that no number of Gauss
 
 @dataclass(frozen=True, eq=False)
 class SuperpixelChoices:
-    """Options and limits by which a scene is cut into superpixels."""
+    """How a scene is cut into superpixels."""
 
     options: SegmentOptions  # Method, and number of superpixels
-    limits: CountLimits  # Limits of the number of Gaussians
-    start_share: float  # Share of the Gaussians with which the fit starts, before it adds the rest
-    shared: SharedTree | None  # Region tree for all counts that a run tries, or None if each count builds a tree
+    start_share: float = 1.0  # Share of the Gaussians with which the fit starts, before it adds the rest
+    shared: SharedTree | None = None  # Region tree for all counts that a run tries; None: each count builds a tree
 
 
 @dataclass(eq=False)
@@ -57,28 +56,29 @@ class SharedTree:
 
     tree: RegionTree | None = None
 
-    def get(self, scene: PicturedScene, choices: SuperpixelChoices) -> RegionTree:
+    def get(self, scene: PicturedScene, options: SegmentOptions, limits: CountLimits) -> RegionTree:
         """Return the tree of a scene, which the first call builds with enough superpixels for the requested count."""
         if self.tree is None:
-            limits = choices.limits
-            self.tree = scene_tree(scene, choices.options, limits, limits.exact or limits.default)
+            self.tree = scene_tree(scene, options, limits, limits.exact or limits.default)
         return self.tree
 
 
 @stage("segment")
-def segment_scene(scene: PicturedScene, choices: SuperpixelChoices, count: int | None) -> Segmentation:
+def segment_scene(
+    scene: PicturedScene, choices: SuperpixelChoices, limits: CountLimits, count: int | None
+) -> Segmentation:
     """Cut every view into superpixels, for exactly ``count`` Gaussians, or for the default number if None.
 
     An exact count is cut from the region tree, which gives a plain wall few superpixels and a fern many. Scenes whose
     pixels differ in importance are always cut from the tree. If the shared tree is too coarse, a finer tree is built.
     """
-    limits, options, num_views = choices.limits, choices.options, len(scene)
+    options, num_views = choices.options, len(scene)
     if count is None and scene.protected is not None:
         count = limits.default
     if count is None:
         start_per_view = max(1, int(limits.per_view * choices.start_share))
         return Segmentation(segment(scene.images, options, start_per_view), limits.default, exact=False)
-    tree = choices.shared.get(scene, choices) if choices.shared else None
+    tree = choices.shared.get(scene, options, limits) if choices.shared else None
     start_count = max(num_views, int(count * choices.start_share))
     if tree is None or start_count > len(tree):
         tree = scene_tree(scene, options, limits, count)
@@ -100,10 +100,10 @@ def scene_tree(scene: PicturedScene, options: SegmentOptions, limits: CountLimit
     return region_tree(images, front_depths(scene), groups, scene.get_pixels().shown)
 
 
-def knee_count(scene: PicturedScene, choices: SuperpixelChoices) -> int:
+def knee_count(scene: PicturedScene, choices: SuperpixelChoices, limits: CountLimits) -> int:
     """Return the number of Gaussians at the knee of the scene's distortion curve, clipped to the limits."""
-    limits, shared = choices.limits, choices.shared or SharedTree()
-    tree = shared.get(scene, choices)
+    shared = choices.shared or SharedTree()
+    tree = shared.get(scene, choices.options, limits)
     usable = tree.counts >= tree.min_regions  # counts without regions larger than MAX_EXTENT
     return max(limits.min_count, min(knee(tree.counts[usable], tree.distortions[usable]), limits.max_count))
 

@@ -36,6 +36,9 @@ def test_the_picture_fits_the_program(script: Any, run: Any) -> None:
 
 def test_a_sentence_that_is_no_longer_true_is_named(script: Any, run: Any) -> None:
     plan = run.made["make_plan"]
-    longer = replace(run, made=run.made | {"make_plan": replace(plan, decode=replace(plan.decode, k=2))})
+    longer = replace(
+        run,
+        made=run.made | {"make_plan": replace(plan, merge=replace(plan.merge, decode=replace(plan.merge.decode, k=2)))},
+    )
     with pytest.raises(script.UntrueError, match="K is 1"):
         script.build_steps(longer)

@@ -62,16 +62,16 @@ def test_every_effort_has_a_meaning() -> None:
 def test_effort_decides_what_is_left_open(effort: str, scene: Scene) -> None:
     plan, own = plan_of(scene, effort=effort), EFFORTS[effort]
     assert plan.fit.steps == own.steps
-    assert plan.match.match == ("overlap" if own.merges else "none")
-    assert plan.superpixels.options.rectangles == own.rectangles
-    assert plan.superpixels.options.early_sweeps == own.early_sweeps
+    assert plan.merge.match.match == ("overlap" if own.merges else "none")
+    assert plan.merge.superpixels.options.rectangles == own.rectangles
+    assert plan.merge.superpixels.options.early_sweeps == own.early_sweeps
 
 
 def test_what_is_given_goes_before_effort(scene: Scene) -> None:
     plan = plan_of(scene, effort="draft", fit_steps=7, match="aabb", rectangles=1.5, early_sweeps=2)
     assert plan.fit.steps == 7
-    assert plan.match.match == "aabb"
-    assert (plan.superpixels.options.rectangles, plan.superpixels.options.early_sweeps) == (1.5, 2)
+    assert plan.merge.match.match == "aabb"
+    assert (plan.merge.superpixels.options.rectangles, plan.merge.superpixels.options.early_sweeps) == (1.5, 2)
 
 
 def test_steps_grow_with_the_root_of_the_share(scene: Scene) -> None:
@@ -129,7 +129,7 @@ def test_networks_are_loaded_where_they_help(
 )
 def test_quick_efforts_run_the_heads_alone(settings: dict[str, Any], refines: bool, scene: Scene) -> None:
     """Unless the networks are named: the refiner takes ten times as long."""
-    networks = plan_of(scene, fit="none", **settings).networks
+    networks = plan_of(scene, fit="none", **settings).merge.networks
     assert networks.options.refiner is refines
     assert any(name.startswith("heads.4") for name in networks.arrays)
     assert any(name.startswith("refiner") for name in networks.arrays) is refines
@@ -139,7 +139,7 @@ def test_missing_networks_of_the_package_are_noted(scene: Scene, monkeypatch: py
     monkeypatch.setitem(IN_PACKAGE, "shipped", Path("missing.safetensors"))
     with record_run() as record:
         plan = plan_of(scene, checkpoint="shipped")
-    assert plan.networks is None
+    assert plan.merge.networks is None
     assert "networks" in record.notes[0]
 
 
@@ -149,29 +149,29 @@ def test_without_photos_a_plan_is_the_same_where_pixels_are_known(settings: dict
     blind, options = replace(scene, images=None), options_of(**settings)
     actual, expected = plan_of(blind, **settings), plan_of(scene, **settings)
     assert actual.settings == expected.settings
-    assert actual.target_psnr == expected.target_psnr
-    assert actual.scored_views == expected.scored_views
+    assert actual.count.target_psnr == expected.count.target_psnr
+    assert actual.score.views == expected.score.views
     assert estimate(blind, options) == estimate(scene, options)
 
 
 def test_a_long_fit_begins_with_a_share(scene: Scene) -> None:
     plan = plan_of(scene)
-    assert plan.superpixels.start_share < 1
-    assert plan.weakens
-    assert not plan.with_fit(replace(plan.fit, fit="none")).weakens
-    assert not plan_of(scene, fit_steps=10).weakens
+    assert plan.merge.superpixels.start_share < 1
+    assert plan.merge.weakens
+    assert not plan.with_fit(replace(plan.fit, fit="none")).merge.weakens
+    assert not plan_of(scene, fit_steps=10).merge.weakens
 
 
 @pytest.mark.parametrize(
     ("settings", "has_tree"), [({}, False), ({"budget": 90}, True), ({"levels": 2}, True), ({"quality": "20dB"}, True)]
 )
 def test_counts_are_cut_from_a_tree(settings: dict[str, Any], has_tree: bool, scene: Scene) -> None:
-    assert (plan_of(scene, **settings).superpixels.shared is not None) == has_tree
+    assert (plan_of(scene, **settings).merge.superpixels.shared is not None) == has_tree
 
 
 def test_a_budget_counts_repeated_views(scene: Scene) -> None:
     twice = scenes.take_views(scene, [0, 1, 2, 0, 1, 2])
-    assert plan_of(twice, budget="2%").limits.exact == round(0.02 * len(twice.gaussians))
+    assert plan_of(twice, budget="2%").count.limits.exact == round(0.02 * len(twice.gaussians))
 
 
 @pytest.mark.parametrize(("settings", "reason"), [({"quality": "-1dB"}, "35dB"), ({"drop": "sky"}, "drop sky")])
@@ -185,8 +185,8 @@ def test_settings_that_need_photos_are_refused(settings: dict[str, Any], reason:
 def test_renders_of_the_input_decide_the_count_where_nothing_else_does(settings: dict[str, Any], scene: Scene) -> None:
     rows = unaligned_scenes.without_order(replace(scene, images=None))
     kept = plan_of(rows, **settings)
-    assert (kept.target_psnr, kept.keeps_fidelity) == (FIDELITY_PSNR, True)
-    assert len(kept.scored_views) == len(rows)
+    assert (kept.count.target_psnr, kept.count.keeps_fidelity) == (FIDELITY_PSNR, True)
+    assert len(kept.score.views) == len(rows)
     assert estimate(rows, options_of(**settings))["psnr_kept"] == FIDELITY_PSNR
     assert estimate(rows, options_of(**settings))["fit"] == "full"  # to the renders, as the run does
 
@@ -194,18 +194,18 @@ def test_renders_of_the_input_decide_the_count_where_nothing_else_does(settings:
 @pytest.mark.parametrize("settings", [{"budget": 100}, {"k": 2}, {"superpixels": "5%"}, {"quality": "20dB"}])
 def test_what_asks_for_a_count_decides_it(settings: dict[str, Any], scene: Scene) -> None:
     rows = unaligned_scenes.without_order(replace(scene, images=None))
-    assert plan_of(rows, **settings).target_psnr == (20 if "quality" in settings else None)
+    assert plan_of(rows, **settings).count.target_psnr == (20 if "quality" in settings else None)
     for known in (rows, unaligned_scenes.without_order(scene)):
-        assert not plan_of(known, **settings).keeps_fidelity
+        assert not plan_of(known, **settings).count.keeps_fidelity
     for known in (scene, replace(scene, images=None)):
-        assert not plan_of(known).keeps_fidelity
+        assert not plan_of(known).count.keeps_fidelity
 
 
 def test_photos_of_another_scene_decide_no_count(scene: Scene) -> None:
     noise = np.random.default_rng(0).random(scene.images.shape, np.float32)
     rows = unaligned_scenes.without_order(replace(scene, images=noise))
     plan, prepared = plan_of(rows), prepare(rows, options_of().prepare)
-    assert (plan.keeps_fidelity, plan.target_psnr) == (True, FIDELITY_PSNR)  # of renders
+    assert (plan.count.keeps_fidelity, plan.count.target_psnr) == (True, FIDELITY_PSNR)  # of renders
     assert add_target(plan, prepared) is plan
     report = compact(rows, threads=1).report
     assert (report.choices["fidelity"]["views"], report.worse) == (len(rows), None)
@@ -216,14 +216,18 @@ def test_photos_decide_the_count_where_rows_are_fewer_than_pixels(scene: Scene) 
     rows = unaligned_scenes.without_order(scene, np.arange(0, len(scene.gaussians), 3))  # fewer than half of the pixels
     rows = replace(rows, gaussians=replace(rows.gaussians, scales=2 * rows.gaussians.scales))
     prepared, plan = prepare(rows, options_of().prepare), plan_of(rows)
-    assert (plan.keeps_fidelity, plan.target_psnr, len(plan.scored_views)) == (True, None, len(rows))
+    assert (plan.count.keeps_fidelity, plan.count.target_psnr, len(plan.score.views)) == (True, None, len(rows))
     known = add_target(plan, prepared)
-    assert known.target_psnr == pytest.approx(psnr_of(rows.gaussians, prepared.input_scene) - FIDELITY_LOSS, abs=0.05)
+    assert known.count.target_psnr == pytest.approx(
+        psnr_of(rows.gaussians, prepared.input_scene) - FIDELITY_LOSS, abs=0.05
+    )
     assert add_target(known, prepared) is known
     estimated = estimate(rows, options_of())
     assert (estimated["psnr_kept"], estimated["loss_kept"]) == (None, FIDELITY_LOSS)
-    assert not plan_of(rows, budget="auto").keeps_fidelity  # the photos' own curve decides
-    assert not plan_of(unaligned_scenes.without_order(scene)).keeps_fidelity  # a share is enough of as many as pixels
+    assert not plan_of(rows, budget="auto").count.keeps_fidelity  # the photos' own curve decides
+    assert not plan_of(
+        unaligned_scenes.without_order(scene)
+    ).count.keeps_fidelity  # a share is enough of as many as pixels
 
 
 @pytest.mark.parametrize(("step", "is_few"), [(3, True), (1, False)])
@@ -242,11 +246,11 @@ def test_an_input_with_holes_is_compared_where_it_has_gaussians(scene: Scene) ->
     rows = replace(rows, gaussians=rows.gaussians[np.flatnonzero(x < np.quantile(x, 0.9))])
     prepared = prepare(rows, options_of().prepare)
     plan = add_target(plan_of(rows), prepared)
-    assert plan.target_psnr == plan.before.covered_psnr - FIDELITY_LOSS > plan.before.psnr
+    assert plan.count.target_psnr == plan.score.before.covered_psnr - FIDELITY_LOSS > plan.score.before.psnr
     given = prepared.frame.enter(rows.gaussians)  # without those that fill the holes
     again = score(Fitted(given, prepared.scene.cameras, None), prepared, plan)
-    assert again.psnr == pytest.approx(plan.before.psnr, abs=0.01)
-    assert again.deciding_psnr == pytest.approx(plan.before.covered_psnr, abs=0.01)
+    assert again.psnr == pytest.approx(plan.score.before.psnr, abs=0.01)
+    assert again.deciding_psnr == pytest.approx(plan.score.before.covered_psnr, abs=0.01)
 
 
 def test_sky_stays_where_no_photo_is_used(scene: Scene) -> None:
@@ -271,10 +275,10 @@ def test_cameras_move_where_it_is_asked_for(scene: Scene) -> None:
 def test_more_views_are_scored_for_a_quality(scene: Scene) -> None:
     wide = scenes.make_scene(scenes.room(), scenes.arc(10, 240, 224))
     some, every = plan_of(wide), plan_of(wide, quality="20dB")
-    assert (len(some.scored_views), some.samples) == (REPORT_VIEWS, True)
-    assert (len(every.scored_views), every.samples) == (10, False)
+    assert (len(some.score.views), some.score.samples) == (REPORT_VIEWS, True)
+    assert (len(every.score.views), every.score.samples) == (10, False)
     small = plan_of(scenes.make_scene(scenes.room(), scenes.arc(10, 24, 16)))
-    assert (len(small.scored_views), small.samples) == (10, False)
+    assert (len(small.score.views), small.score.samples) == (10, False)
 
 
 def test_reports_say_what_was_settled(scene: Scene) -> None:
@@ -321,10 +325,11 @@ def test_the_estimate_is_what_the_run_does(
     assert count <= run["num_gaussians"]
     assert run["exact"] == (settings in SETTLED)
     for plan in plans:  # none of a scene in blocks
-        assert (plan.limits, plan.decode, plan.match.match) == (choices.limits, choices.decode, choices.match.match)
+        assert (plan.count.limits, plan.merge.decode) == (choices.count.limits, choices.merge.decode)
+        assert plan.merge.match.match == choices.merge.match.match
         assert (plan.fit.fit, plan.fit.steps, plan.fit.share) == (choices.fit.fit, choices.fit.steps, choices.fit.share)
-        assert run["k"] == plan.decode.k
-        assert (plan.checkpoint is None) == (run["checkpoint"] == "none")
+        assert run["k"] == plan.merge.decode.k
+        assert (plan.merge.checkpoint is None) == (run["checkpoint"] == "none")
 
 
 @pytest.mark.parametrize(
@@ -342,13 +347,13 @@ def test_runs_grow_if_they_see_each_photo_twice(effort: str, num_views: int, gro
 def test_limits_beyond_what_wrong_depth_bears_are_as_no_budget(budget: str) -> None:
     size, wrong = SceneSize(1_000_000, 10, 250, 400, True, rendered=False), Agreement(0.3, 0.6, 0.1)
     with record_run() as record:
-        limits = plan_scene(size, resolve_budget(size, options_of(budget=budget), wrong)).limits
-        usual = plan_scene(size, options_of()).limits
+        limits = plan_scene(size, resolve_budget(size, options_of(budget=budget), wrong)).count.limits
+        usual = plan_scene(size, options_of()).count.limits
     assert (limits.exact, limits.count, limits.default) == (usual.exact, usual.count, usual.default)
     assert limits.most == 44_000
     assert noted(record.notes, "44,000", budget)
     asked = resolve_budget(size, options_of(budget="2%"), wrong)
-    assert plan_scene(size, asked).limits.count == 20_000
+    assert plan_scene(size, asked).count.limits.count == 20_000
 
 
 def test_coarser_levels_are_expected_to_take_less_time(scene: Scene) -> None:

@@ -153,18 +153,18 @@ def extend_features(
                 )
             checkpoint = Checkpoint(state.networks, Path(state.checkpoint), __version__, {})
         plan = make_plan(prepared, options, checkpoint)
-        weights = plan.networks
+        weights = plan.merge.networks
         if weights is None or not weights.options.encoder or not weights.options.makes_children:
             raise UsageError(
                 f"recipe paper: expected networks with an encoder and absolute outputs, {options.checkpoint} lacks them"
             )
-        groups = segment_scene(prepared_scene, plan.superpixels, None).groups
-        features, members, context = encode_groups(prepared_scene, groups, plan)
+        groups = segment_scene(prepared_scene, plan.merge.superpixels, plan.count.limits, None).groups
+        features, members, context = encode_groups(prepared_scene, groups, plan.merge, plan.seed)
         assert isinstance(context, NetworkContext)
         samples = sample_fronts(members, prepared_scene.cameras, state)
         pixel_saliency = scene_saliency(prepared_scene.images)
         if state is None:
-            merged = merge(features, match(features, plan.match), context)
+            merged = merge(features, match(features, plan.merge.match), context)
             saliency = group_saliency(merged, members, pixel_saliency)
             extended = _refine_groups(merged, context, saliency, samples, prepared.frame)
         else:
@@ -172,13 +172,14 @@ def extend_features(
             if degree != expected:
                 raise UsageError(f"expected harmonics of degree {expected}, as in the state, got {degree}")
             saliency = group_saliency(features, members, pixel_saliency)
-            extended = _join_batch(state, features, saliency, context, samples, plan.match)
+            extended = _join_batch(state, features, saliency, context, samples, plan.merge.match)
     numbers = {"num_views": len(prepared_scene), "num_input": scene.num_gaussians, "num_new": len(features)}
     notes = [*record.notes, *([NOT_COMPARED] if state is not None and world == UNKNOWN_WORLD else [])]
     report = BatchReport(
         **numbers, num_gaussians=len(extended), num_kept=0, pictures=prepared.reference.name, views={},
         sh_degree=scene.gaussians.sh_degree, seconds=record.seconds,
-        choices=record.choices | plan.network_facts | {"world": world}, notes=tuple(notes), options=options.to_dict(),
+        choices=record.choices | plan.merge.network_facts | {"world": world}, notes=tuple(notes),
+        options=options.to_dict(),
     )  # fmt: skip
     input_names = prepared.input_scene.names
     names = tuple(input_names[prepared.repeated.index(view)] for view in range(len(prepared_scene)))

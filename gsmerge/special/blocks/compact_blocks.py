@@ -98,7 +98,7 @@ def compact_blocks(
     the same photos.
     """
     scene = scene.numpy()
-    count, limit = len(blocks), plan.limits.count
+    count, limit = len(blocks), plan.count.limits.count
     if scene.images is not None:
         note(f"compacted in {count} blocks of views: photos keep their exposures, and new views are not estimated")
     with stage("partition"):
@@ -107,7 +107,7 @@ def compact_blocks(
         # Blocks take the steps of the fit, the networks and the density that were chosen for the whole scene
         checkpoint = options.checkpoint if plan.settings["checkpoint"] != "none" else "none"
         options = options.with_settings({"fit_steps": plan.fit.steps, "checkpoint": checkpoint})
-        options = replace(options, fit=replace(options.fit, share=plan.limits.share))
+        options = replace(options, fit=replace(options.fit, share=plan.count.limits.share))
     size = gaussians_at_once(scene.num_gaussians, count)
     memory = memory_bytes(size, num_rest=3 * scene.gaussians.shN.shape[1])
     engine = options.blocks.engine
@@ -169,7 +169,7 @@ def join_reports(
         numbers = [value for value in values if value is not None]
         return None if len(numbers) < len(values) else float(np.average(numbers, weights=num_views))
 
-    scored = sum(len(start.plan.scored_views) for start, psnr in zip(starts, psnrs, strict=True) if psnr is not None)
+    scored = sum(len(start.plan.score.views) for start, psnr in zip(starts, psnrs, strict=True) if psnr is not None)
     before, after = mean([start.psnr_before for start in starts]), mean(psnrs)
     reference = None if before is None else starts[0].prepared.reference.name
     pictures = OWN_PHOTOS if reference == PHOTOS else reference
@@ -252,7 +252,7 @@ def fit_block(start: BlockStart, shared_start: tuple[Gaussians, np.ndarray], gro
 def score_block(start: BlockStart, gaussians: Gaussians, _: int) -> float | None:
     """Return the PSNR (dB) of the result of all blocks on the photos of one block; None without photos."""
     begin_part("score")
-    measured = measure_result(gaussians, start.prepared, start.plan)
+    measured = measure_result(gaussians, start.prepared, start.plan.score)
     return None if measured is None else measured.psnr
 
 
@@ -261,7 +261,7 @@ def finish_joined(
     plan: Plan,
 ) -> Gaussians:  # fmt: skip
     """Prune the canonical Gaussians of all blocks, move them into the world, meet the budget, and return them."""
-    limit = plan.limits.count
+    limit = plan.count.limits.count
     if plan.fit.min_contribution > 0:
         # Gaussians that no camera sees are dropped. If the options fill the budget, as many of these are kept as the
         # budget allows

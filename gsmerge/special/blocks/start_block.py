@@ -43,14 +43,14 @@ def start_block(
     begin_part("merge")
     prepared = prepare(piece, options.prepare, frame)
     plan = make_plan(prepared, options)
-    decoded = merge_views(prepared, plan, plan.limits.count)
+    decoded = merge_views(prepared, plan, plan.count.limits.count)
     # The owner of a Gaussian is searched among the views that share surfaces with the block, because other views do not
     # see the Gaussian
     is_candidate = covisibility.weights[list(block.own)].sum(0) > 0
     is_candidate[list(block.own)] = True
     means, candidates = frame.leave(decoded.gaussians).means, np.flatnonzero(is_candidate).tolist()
     keep = np.isin(owning_views(means, covisibility, candidates), block.own)
-    before = measure_input(prepared, plan)
+    before = measure_input(prepared, plan.score)
     return BlockStart(
         block=block,
         gaussians=decoded.gaussians[keep],

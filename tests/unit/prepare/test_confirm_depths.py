@@ -210,7 +210,7 @@ def test_views_that_agree_get_more_superpixels(flat: Scene) -> None:
     for scene in (flat, with_nearer_half(flat, [1]), with_nearer_half(flat, [0, 2])):
         with record_run() as log:
             plan = make_plan(prepare(scene), AUTO)
-        shares.append(plan.superpixels.options.share)
+        shares.append(plan.merge.superpixels.options.share)
         agreement = confirm_depths(scene)
         assert log.choices["agreement"] == agreement.to_dict()
         assert shares[-1] == pytest.approx(agreement.share, rel=0.05)
@@ -226,21 +226,21 @@ def test_an_automatic_budget_is_the_share_that_the_depths_bear(flat: Scene) -> N
     for scene in (flat, with_nearer_half(flat, [0, 2])):
         with record_run() as log:
             plan = make_plan(prepare(scene), auto)
-        assert plan.limits.count == pytest.approx(confirm_depths(scene).share * len(scene.gaussians), rel=0.05)
+        assert plan.count.limits.count == pytest.approx(confirm_depths(scene).share * len(scene.gaussians), rel=0.05)
         assert any(note.startswith("budget: ") and "confirm" in note for note in log.notes)
-        assert not plan.auto_count
+        assert not plan.count.auto_count
         assert plan.settings["budget"] == "auto"
     without_fit = make_plan(prepare(flat), auto.with_settings({"fit": "none"}))
     lone = make_plan(prepare(scenes.take_views(flat, [0])), auto)
-    assert without_fit.auto_count
-    assert lone.auto_count  # the curve decides: nothing can be compared
+    assert without_fit.count.auto_count
+    assert lone.count.auto_count  # the curve decides: nothing can be compared
 
 
 def test_scenes_whose_depths_cannot_be_compared_get_the_usual_share(flat: Scene) -> None:
     room = scenes.make_scene(scenes.room(), scenes.arc(4, 48, 36))
     for scene in (scenes.take_views(flat, [0]), unaligned_scenes.without_order(room)):
         with record_run() as log:
-            assert make_plan(prepare(scene), AUTO).superpixels.options.share == CompactOptions().segment.share
+            assert make_plan(prepare(scene), AUTO).merge.superpixels.options.share == CompactOptions().segment.share
         assert "compared" in log.notes[0]
         assert "agreement" not in log.choices
 

@@ -127,7 +127,7 @@ def test_repeated_views_share_the_camera_that_was_moved(small: Scene) -> None:
     found = prepared.with_cameras(replace(prepared.scene.cameras, viewmats=placed)).final_cameras()
     np.testing.assert_allclose(prepared.frame.enter_cameras(found).viewmats, placed[[0, 1, 0, 2]], atol=1e-9)
     some = replace(prepared, reference=replace(prepared.reference, score_views=(0, 2)))
-    assert make_plan(some, options).scored_views == (0, 2, 3)
+    assert make_plan(some, options).score.views == (0, 2, 3)
 
 
 @pytest.mark.parametrize("cameras", [True, False])

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import cast
+from typing import Any, cast
 
 import pytest
 from messages import noted, refuses
@@ -14,7 +14,7 @@ from messages import noted, refuses
 from gsmerge.fit import FitOptions, Fitted
 from gsmerge.kernels import elementary
 from gsmerge.plan.counts import FIDELITY_LOSS, exact_count, level_counts, max_allowed
-from gsmerge.plan.plan import Plan
+from gsmerge.plan.plan import CountPlan, Plan
 from gsmerge.prepare.prepared import Prepared
 from gsmerge.prepare.row_colors import PHOTOS
 from gsmerge.results.candidate import Candidate
@@ -48,9 +48,8 @@ def make_plan(
     limits = SimpleNamespace(
         min_count=least, max_count=most, default=most if default is None else default, num_input=most
     )
-    kept = {"keeps_fidelity": keeps_fidelity, "auto_count": False, "max_drop": None, "fit": FitOptions(fit="none")}
-    kept |= {"clean": CleanOptions(), "file_size": None}
-    return cast("Plan", SimpleNamespace(target_psnr=target_psnr, limits=limits, levels=levels, **kept))
+    count = CountPlan(cast("Any", limits), target_psnr, keeps_fidelity, None, auto_count=False, levels=levels)
+    return cast("Plan", SimpleNamespace(count=count, fit=FitOptions(fit="none"), clean=CleanOptions()))
 
 
 @pytest.mark.parametrize(
@@ -163,7 +162,7 @@ def rises(count: int) -> float:
 
 def search(curve: Callable[[int], float], target: float, start: int, least: int, most: int) -> CountSearch:
     """Run a search on a curve that is known, instead of building scenes."""
-    counts = CountSearch(make_plan(target_psnr=target, least=least, most=most), start)
+    counts = CountSearch(make_plan(target_psnr=target, least=least, most=most).count, start)
     counts.run(curve)
     return counts
 
@@ -223,7 +222,7 @@ def search_as_good_as_input(
 ) -> CountSearch:
     """Run the search that keeps the input by default: 32.5 dB of its renders, or of photos."""
     plan = make_plan(target_psnr=32.5, most=most, default=default, keeps_fidelity=True)
-    counts = CountSearch(plan, default, rendered)
+    counts = CountSearch(plan.count, default, rendered)
     counts.run(curve)
     return counts
 
@@ -282,7 +281,7 @@ def test_the_note_says_that_the_largest_count_is_too_few() -> None:
 def judge_left_out(curve: Callable[[int], float], target: float, most: int | None = None) -> CountSearch:
     """Run a search that photos judge which the builds leave out."""
     photos = cast("LeftOut", SimpleNamespace(photos=range(2)))
-    counts = CountSearch(make_plan(target_psnr=target, least=10, most=100_000), 1000, left_out=photos, most=most)
+    counts = CountSearch(make_plan(target_psnr=target, least=10, most=100_000).count, 1000, left_out=photos, most=most)
     counts.run(curve)
     return counts
 

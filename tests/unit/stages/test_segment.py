@@ -37,17 +37,18 @@ def scene() -> Scene:
     return scenes.make_scene(scenes.room(), scenes.arc(3, 32, 24), noise=0.01)
 
 
-def scene_and_choices(scene: Scene, **settings: object) -> tuple[Scene, SuperpixelChoices]:
+def scene_and_choices(scene: Scene, **settings: object) -> tuple[Scene, SuperpixelChoices, CountLimits]:
     options = CompactOptions().with_settings({"fit": "none"} | settings)
     prepared = prepare(scene, options.prepare)
-    return prepared.scene, make_plan(prepared, options).superpixels
+    plan = make_plan(prepared, options)
+    return prepared.scene, plan.merge.superpixels, plan.count.limits
 
 
 def test_a_fit_begins_with_a_share_of_the_number(scene: Scene) -> None:
     whole = segment_scene(*scene_and_choices(scene, **SHARE), None)
-    canonical, choices = scene_and_choices(scene, **SHARE, fit="full")
+    canonical, choices, limits = scene_and_choices(scene, **SHARE, fit="full")
     assert choices.start_share < 1
-    segmentation = segment_scene(canonical, choices, None)
+    segmentation = segment_scene(canonical, choices, limits, None)
     assert segmentation.count == pytest.approx(whole.count, rel=0.02)
     assert len(segmentation.groups) < 1.02 * choices.start_share * segmentation.count
 
@@ -214,7 +215,7 @@ def test_knee_count_of_a_wall_is_the_least_that_keeps_regions_small() -> None:
 
     def count(tree: RegionTree, most: int = 1000) -> int:
         limits = CountLimits(1, 1, min_count=1, max_count=most, exact=None, num_pixels=1, num_input=1000, most=1000)
-        return knee_count(scene, SuperpixelChoices(SegmentOptions(), limits, 1.0, SharedTree(tree)))
+        return knee_count(scene, SuperpixelChoices(SegmentOptions(), shared=SharedTree(tree)), limits)
 
     assert count(wall) == wall.min_regions < 150
     assert count(wall, most=5) == 5
