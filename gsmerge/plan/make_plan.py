@@ -33,6 +33,7 @@ from gsmerge.raster.photos import scored_tiles
 from gsmerge.runtime.record import note, stage
 from gsmerge.settings.budget import AUTO
 from gsmerge.settings.compact import COUNTS, OURS, CompactOptions
+from gsmerge.settings.fit import FitOptions
 from gsmerge.settings.setting import flat_settings
 from gsmerge.settings.stages import SHARE, USUAL_K, DecodeOptions, MatchOptions, PrepareOptions, SegmentOptions
 from gsmerge.stages.fit_pairs import choose_power
@@ -60,46 +61,61 @@ def make_plan(
     """
     check_pictures(prepared, options)
     with stage("prepare"):
-        size, budget, cameras = prepared.size, options.budget, prepared.scene.cameras
+        size = prepared.size
         checkpoint = checkpoint or load_networks(options, size)
         filled = fill_options(prepared, options)
         has_repeats = len(prepared.scene) < len(prepared.input_scene)
         num_input = prepared.input_scene.num_gaussians if has_repeats else None  # a budget may be a share of it
         plan = plan_scene(size, filled, num_input=num_input, keeps=keeps_fidelity(size, options))
         merges_pairs = plan.merges_pairs and checkpoint is None
+        cuts = cuts_views(options, size)
         fit = fit_to_pictures(prepared, filled, plan.fit, merges_pairs=merges_pairs)
         if plan.count.keeps_fidelity and has_few_rows(size):
             few = f"the scene has only {size.num_gaussians:,} Gaussians, fewer than its photos need"
             note(f"{few}; the result has at most half of them, and more may show the photos better: --budget NUMBER")
-        # a quality that the user asks for is measured on all pixels, and small views have too few tiles for a sample
-        samples = plan.count.target_psnr is None and not plan.count.keeps_fidelity
-        samples = samples and scored_tiles(0, cameras.width, cameras.height, 2) is not None
-        # Views among those whose pictures show the scene. The effort decides how many a report needs; scores that
-        # decide the number of Gaussians take more. All views that were placed count
-        scored = own_views(prepared)
-        if not prepared.reference.placed:
-            report_views, num_views = EFFORTS[options.effort].report_views, len(scored)
-            chosen = pick_views(num_views, report_views) if samples else scored_views(num_views)
-            scored = tuple(scored[i] for i in chosen)
-        # all builds of a run share one tree of regions, by which they cut the views
-        has_tree = plan.count.has_quality or plan.count.levels > 1 or plan.count.limits.count is not None
-        has_tree = has_tree and cuts_views(options, size) and not merges_pairs
-        superpixels = replace(plan.merge.superpixels, shared=SharedTree() if has_tree else None)
-        merge = replace(plan.merge, superpixels=superpixels, checkpoint=checkpoint)
-        if merges_pairs:
-            count = plan.count.limits.count or plan.count.limits.default
-            merge = replace(merge, power=choose_power(count, prepared, fit, plan.seed))
-        new_views = plan.score.new_views and prepared.agreement is not None and prepared.can_leave_out
         return replace(
             plan,
-            count=replace(plan.count, file_size=file_size(budget)),
-            merge=merge,
+            count=replace(plan.count, file_size=file_size(options.budget)),
+            merge=plan_merge(prepared, plan, fit, checkpoint, merges_pairs=merges_pairs, cuts=cuts),
             fit=fit,
-            score=replace(plan.score, views=scored, samples=samples, new_views=new_views),
+            score=plan_scores(prepared, plan, EFFORTS[options.effort].report_views),
             merges_pairs=merges_pairs,
             settings=replace(options, decode=plan.merge.decode).to_dict() | {"fit_steps": fit.steps},
             run=run,
         )
+
+
+def plan_merge(
+    prepared: Prepared, plan: Plan, fit: FitOptions, checkpoint: Checkpoint | None, *, merges_pairs: bool, cuts: bool
+) -> MergePlan:
+    """Add to the plan of merging the networks, what all builds of a run share, and the power by which pairs are merged.
+
+    All builds of a run share one tree of regions, by which they cut the views. ``cuts``: views are cut at all.
+    """
+    if merges_pairs:
+        count = plan.count.limits.count or plan.count.limits.default
+        power = choose_power(count, prepared, fit, plan.seed)
+        return replace(plan.merge, checkpoint=checkpoint, power=power)
+    has_tree = plan.count.has_quality or plan.count.levels > 1 or plan.count.limits.count is not None
+    superpixels = replace(plan.merge.superpixels, shared=SharedTree() if has_tree and cuts else None)
+    return replace(plan.merge, superpixels=superpixels, checkpoint=checkpoint)
+
+
+def plan_scores(prepared: Prepared, plan: Plan, report_views: int) -> ScorePlan:
+    """Choose the views in which input and results are scored, among those whose pictures show the scene.
+
+    A report needs ``report_views``; scores that decide the number of Gaussians take more. All views that were placed
+    count. A quality that the user asks for is measured on all pixels, and small views have too few tiles for a sample.
+    """
+    cameras = prepared.scene.cameras
+    decides = plan.count.target_psnr is not None or plan.count.keeps_fidelity
+    samples = not decides and scored_tiles(0, cameras.width, cameras.height, 2) is not None
+    views = own_views(prepared)
+    if not prepared.reference.placed:
+        chosen = pick_views(len(views), report_views) if samples else scored_views(len(views))
+        views = tuple(views[i] for i in chosen)
+    new_views = plan.score.new_views and prepared.agreement is not None and prepared.can_leave_out
+    return replace(plan.score, views=views, samples=samples, new_views=new_views)
 
 
 def plan_scene(
