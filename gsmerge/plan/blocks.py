@@ -8,7 +8,9 @@ from gsmerge.settings.compact import CompactOptions
 
 BLOCK_GAUSSIANS = 8_000_000  # Gaussians of a block's own views, if the number of blocks is automatic
 WHOLE_GAUSSIANS = 20_000_000  # Gaussians up to which a scene is compacted in one piece, unless it has many views
-BLOCK_VIEWS, WHOLE_VIEWS = 42, 168  # the two limits above as numbers of views, if blocks see little of each other
+# the two limits above as numbers of views, if blocks see little of each other
+BLOCK_VIEWS = 42
+WHOLE_VIEWS = 168
 
 
 def choose_blocks(scene: SceneSize, options: CompactOptions) -> int:

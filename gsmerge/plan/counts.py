@@ -147,7 +147,8 @@ def count_limits(
     A budget that is a share refers to ``num_input`` Gaussians, or to those of the scene if ``num_input`` is None.
     Raises UsageError if more superpixels are requested than there are pixels, or fewer Gaussians than views.
     """
-    count, views = scene.num_gaussians, scene.num_views
+    count = scene.num_gaussians
+    views = scene.num_views
     exact = exact_count(budget, count if num_input is None else num_input, scene.sh_degree)
     if exact is not None:
         exact = min(exact, count)

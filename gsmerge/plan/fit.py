@@ -26,7 +26,9 @@ def resolve_fit(options: CompactOptions, size: SceneSize, limits: CountLimits) -
 
     In a draft without a fit, Gaussians that no photo shows are kept. A draft of a scene without views has no fit.
     """
-    fit, effort, views = options.fit, EFFORTS[options.effort], size.num_views
+    fit = options.fit
+    effort = EFFORTS[options.effort]
+    views = size.num_views
     if views == 0 and fit.fit_steps is None and not effort.fits_alone:
         fit = replace(fit, fit="none")
     prunes = fit.fit != "none" or effort.prunes
@@ -62,7 +64,8 @@ def fit_to_pictures(prepared: Prepared, options: CompactOptions, fit: FitOptions
     the input may have them, and is not scored on held-out patches. Gaussians beyond all views, and Gaussians that
     hardly show in any view, are kept, because they belong to the scene.
     """
-    scale, moves = 1.0, False
+    scale = 1.0
+    moves = False
     if fit.fit != "none":
         scale, problem = photo_scale(prepared.scene, fit, auto=EFFORTS[options.effort].large_photos)
         if problem is not None:

@@ -8,12 +8,15 @@ from gsmerge.prepare.row_colors import RENDERS
 from gsmerge.runtime.record import RunPart
 
 # Number of candidates that a search usually builds: first, if photos score them; second, if renders of the input do
-USUAL_BUILDS, USUAL_BUILDS_OF_RENDERS = 3, 1
+USUAL_BUILDS = 3
+USUAL_BUILDS_OF_RENDERS = 1
 # Work of the stages of a build, and of scoring the input, for each view, in steps of a fit
-STAGE_STEPS, INPUT_STEPS = 10.0, 3.0
+STAGE_STEPS = 10.0
+INPUT_STEPS = 3.0
 # Cost of the trial that estimates new views, as a share of building the result; cost of building a coarser level of
 # detail, as a share of building the next finer level
-TRIAL_SHARE, LEVEL_SHARE = 0.25, 0.6
+TRIAL_SHARE = 0.25
+LEVEL_SHARE = 0.6
 
 
 def usual_builds(*, has_target: bool, rendered: bool) -> int:
@@ -23,7 +26,8 @@ def usual_builds(*, has_target: bool, rendered: bool) -> int:
 
 def run_parts(prepared: Prepared, plan: Plan) -> list[RunPart]:
     """Return the parts that a run in one piece is expected to have, in their order, after the fits of a curve."""
-    views, steps = len(prepared.scene), 0 if plan.fit.fit == "none" else plan.fit.steps
+    views = len(prepared.scene)
+    steps = 0 if plan.fit.fit == "none" else plan.fit.steps
     build = RunPart("build", STAGE_STEPS * views, steps)
     count = usual_builds(has_target=plan.count.target_psnr is not None, rendered=prepared.reference.name == RENDERS)
     trial = RunPart("trial", TRIAL_SHARE * build.stages, TRIAL_SHARE * steps)

@@ -127,7 +127,9 @@ def plan_scene(
     see :func:`gsmerge.plan.counts.count_limits`. ``keeps``: what :func:`keeps_fidelity` has returned for the options
     of the caller; None: what this function returns for ``options``.
     """
-    effort, budget, segment = EFFORTS[options.effort], options.budget, options.segment
+    effort = EFFORTS[options.effort]
+    budget = options.budget
+    segment = options.segment
     decode = resolve_decode(options, size)
     keeps = keeps_fidelity(size, options) if keeps is None else keeps
     if segment.superpixels == AUTO:  # deciding it would need computation
@@ -189,9 +191,12 @@ def note_ignored(scene: Scene, options: CompactOptions) -> None:
 
 def fill_options(prepared: Prepared, options: CompactOptions) -> CompactOptions:
     """Fill in budget, K, superpixels and clean-up if the options leave them to the scene; notes say why."""
-    size, agreement = prepared.size, prepared.agreement
+    size = prepared.size
+    agreement = prepared.agreement
     options = resolve_budget(size, options, agreement)
-    decode, segment, clean = resolve_decode(options, size), options.segment, options.clean
+    decode = resolve_decode(options, size)
+    segment = options.segment
+    clean = options.clean
     if segment.superpixels == AUTO:
         text, why = describe_share(agreement)
         note(f"superpixels: {text} of the pixels, because {why}")

@@ -66,7 +66,8 @@ def check_networks(checkpoint: Checkpoint, options: CompactOptions) -> None:
             f"recipe paper: expected networks with absolute outputs, {checkpoint.path} has {outputs} ones;"
             " gsmerge lab train --preset paper makes them"
         )
-    most, count = checkpoint.networks.options.max_children, options.decode.max_k
+    most = checkpoint.networks.options.max_children
+    count = options.decode.max_k
     if count > most:
         problem = f"k: expected at most {most} with the absolute outputs of {checkpoint.path}"
         raise UsageError(f"{problem}, got {count}")

@@ -25,7 +25,8 @@ def distinct_views(scene: Scene) -> tuple[list[int], list[int]]:
     Two views are equal if their cameras, photos, masks and Gaussians are equal.
     """
     kinds = camera_kinds(scene.cameras)
-    distinct, indices = list[int](), list[int]()
+    distinct = list[int]()
+    indices = list[int]()
     for view, kind in enumerate(kinds):
         equal = (
             i for i, earlier in enumerate(distinct) if kinds[earlier] == kind and _equal_views(scene, earlier, view)

@@ -150,12 +150,15 @@ def use_renders(p: Prepared, _: PrepareOptions) -> Prepared:
     """Use renders of the Gaussians if there is no other picture, with a note."""
     if p.reference.name:
         return p
-    has_photos, placed, every = p.scene.images is not None, p.reference.placed, tuple(range(len(p.scene)))
+    has_photos = p.scene.images is not None
+    placed = p.reference.placed
+    every = tuple(range(len(p.scene)))
     reason = "photos do not count" if has_photos else "no photos, and the rows are not the pixels of the views"
     remedy = "" if has_photos else "; name photos with --images"
     if not placed:  # if views were placed, another note has said this
         note(f"{reason}: renders of the scene itself are used instead{remedy}")
-    drawn, scored = draw_pictures(_without_photos(p)), every[: len(every) // HELD_OUT] if placed else every
+    drawn = draw_pictures(_without_photos(p))
+    scored = every[: len(every) // HELD_OUT] if placed else every
     shown = tuple(view for view in scored if drawn.images[view].any())  # any result is right in an empty view
     change = f"photos do not show the Gaussians: {RENDERS} are used in their place" if has_photos else ""
     return p.after(change, scene=drawn, reference=Reference(RENDERS, shown or scored, placed))
@@ -189,7 +192,8 @@ def move_wrong_poses(p: Prepared, options: PrepareOptions) -> Prepared:
 
 def keep_changed_files(p: Prepared, _: PrepareOptions) -> Prepared:
     """Keep the photos as they were read if a step changed one that counts."""
-    files, reference = p.reference.photo_files, p.reference
+    files = p.reference.photo_files
+    reference = p.reference
     if files is None or has_changed(files, p.scene, reference.score_views, p.repeated):
         return p
     return replace(p, reference=replace(reference, photo_files=None))
@@ -210,7 +214,8 @@ def fill_scene(p: Prepared, options: PrepareOptions) -> Prepared:
     """Fill holes with Gaussians, and draw what photos leave out."""
     if not p.reference.of_views:
         return p
-    views, masks = list(p.reference.score_views), p.scene.masks
+    views = list(p.reference.score_views)
+    masks = p.scene.masks
     shown = np.zeros(p.scene.images.shape[:3], bool)
     has_row_colors = p.reference.name == ROW_COLORS  # these pictures have colours at all pixels
     shown[views] = True if has_row_colors or masks is None else masks[views]
@@ -225,7 +230,8 @@ def fill_scene(p: Prepared, options: PrepareOptions) -> Prepared:
 
 def score_shown_views(p: Prepared, _: PrepareOptions) -> Prepared:
     """Score no view that counts nowhere any more, since holes were filled."""
-    scene, views = p.scene, p.reference.score_views
+    scene = p.scene
+    views = p.reference.score_views
     if not p.reference.of_views or scene.empty is None or scene.masks is None:
         return p
     seen = tuple(view for view in views if scene.masks[view].any())
@@ -236,13 +242,15 @@ def draw_unseen(p: Prepared, _: PrepareOptions) -> Prepared:
     """Add pictures of Gaussians that no view sees, with a note, so that a fit keeps them."""
     if p.scene.has_own_pixels or p.reference.placed:
         return p
-    drawn, reference = draw_outside(p.scene), p.reference
+    drawn = draw_outside(p.scene)
+    reference = p.reference
     if drawn is p.scene:
         return p
     change = f"{count_words(len(drawn) - len(p.scene), 'picture')} drawn of Gaussians that no view sees"
     if reference.name == RENDERS:  # all pixels of all pictures are drawings
         views = (*reference.score_views, *range(len(p.scene), len(drawn)))
-        drawn, reference = replace(drawn, masks=None), replace(reference, score_views=views)
+        drawn = replace(drawn, masks=None)
+        reference = replace(reference, score_views=views)
     return p.after(change, scene=drawn, reference=reference)
 
 

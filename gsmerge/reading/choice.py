@@ -33,7 +33,8 @@ def make_choice(
 
     ``can_be_named``: an option that names the place takes it.
     """
-    root, option = files.root or files.ply.parent, ""
+    root = files.root or files.ply.parent
+    option = ""
     path = place.relative_to(root) if isinstance(place, Path) and place.is_relative_to(root) else place
     if can_be_named and (isinstance(place, Path) or place == ESTIMATED_CAMERAS):
         option = shlex.join([OPTIONS[kind], NONE if place == ESTIMATED_CAMERAS else str(place)])

@@ -57,7 +57,8 @@ def is_needed(candidate: Candidate, tried: Sequence[Evidence]) -> bool:
     """
     if not candidate.replaces_files:
         return not any(map(certainly_fits, tried))
-    files, best = tried[0].files, choose(tried)
+    files = tried[0].files
+    best = choose(tried)
     if best is not None:
         return best.own_views > best.num_views
     blames_photos = "images" in files.named and Path(find_cause(tried).path).is_relative_to(files.images or files.ply)
@@ -117,8 +118,10 @@ def find_best(tried: Sequence[Evidence]) -> Evidence:
 
 def explain_refusal(tried: Sequence[Evidence]) -> SceneError:
     """Return what spoke against the best candidate, if none is chosen, with what the user can do."""
-    files, best = tried[0].files, find_best(tried)
-    cause, cameras = best.error or find_cause(tried), best.files.cameras
+    files = tried[0].files
+    best = find_best(tried)
+    cause = best.error or find_cause(tried)
+    cameras = best.files.cameras
     problem = cause.problem
     if len(tried) > 1 and cameras is not None and cause.path != str(cameras):
         num_files = sum(one.files.cameras is not None for one in tried)
@@ -136,7 +139,8 @@ def choose_photos(shown: Evidence, bare: Evidence, views: Views) -> Evidence:
     cameras, if the photos cannot be read, or if they were found by the cameras' names. Cameras that merely see the
     Gaussians may still belong to another scene.
     """
-    cause, folder = shown.error, views.place
+    cause = shown.error
+    folder = views.place
     if cause is None or bare.error is not None:
         return shown
     is_photo = Path(cause.path).suffix.lower() in IMAGE_SUFFIXES or cause.path == str(folder) or not views.photos.named
@@ -169,7 +173,8 @@ def give_reasons(
 
     If no cameras were chosen, the photos are those of the cameras that a refusal is about.
     """
-    files, choices = candidates[0].files, list[Choice]()
+    files = candidates[0].files
+    choices = list[Choice]()
     evidence_on = {one.candidate: one for one in tried}
     for candidate in candidates:
         one = evidence_on.get(candidate)
@@ -196,7 +201,8 @@ def _judge_photos(best: Evidence, files: SceneFiles) -> list[Choice]:
     """Say whether the photos of a candidate for the cameras are used, and why."""
     if best.photo_place is None:
         return []
-    reason, error = f"show {best.num_shown} of {best.num_views} views", best.photo_error or best.error
+    reason = f"show {best.num_shown} of {best.num_views} views"
+    error = best.photo_error or best.error
     if isinstance(error, MismatchError):
         reason = "show none of the views"
     elif isinstance(error, UnseenError) and error.sight is not None:

@@ -41,7 +41,9 @@ MeasureBare = Callable[[CameraFile], Evidence]  # without photos, whatever lense
 
 def examine(ply: GaussianFile, views: Views, hints: ReadHints) -> Evidence:
     """Examine cameras with the photos that may show their views, and without photos if these do not."""
-    camera_file, photos, files = views.camera_file, views.photos, views.files
+    camera_file = views.camera_file
+    photos = views.photos
+    files = views.files
     stored = None if camera_file is None else replace(camera_file, images=())
     start = Evidence(views.candidate, stored=stored, photo_place=views.place)
     if views.error is not None:
@@ -131,7 +133,8 @@ def _try_photos(
 
     Raises SceneError if neither can be made.
     """
-    base, error = None, None
+    base = None
+    error = None
     if any(photos.named) and not is_without_names(camera_file):
         base = measure(camera_file, photos)
         error = base.error
@@ -172,7 +175,8 @@ def _examine_photos(
         fit = trial.checked.grid_fit
         part = None if shows_most else choose_part(trial.load.scene, trial.proposed, camera_file, fit)
         trial = trial if part is None else _try_photos(measure, measure_bare, camera_file, part)
-    checked, evidence = trial.checked, trial.base
+    checked = trial.checked
+    evidence = trial.base
     is_wrong_shape = shapes_differ and part is None
     if not any(checked.paths) or (is_wrong_shape and not checked.explain_most):
         # an error of photos of another shape says nothing, unless lenses may have changed the shape

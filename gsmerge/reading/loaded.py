@@ -62,7 +62,9 @@ class Loaded:
     @property
     def recognised(self) -> dict[str, Any]:
         """Facts about the input for a report, as plain JSON types."""
-        cameras, recovery, info = self.scene.cameras, self.recovery, self.info
+        cameras = self.scene.cameras
+        recovery = self.recovery
+        info = self.info
         facts = {
             "path": str(self.files.ply),
             "sha256": self.sha256,

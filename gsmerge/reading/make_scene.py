@@ -90,9 +90,12 @@ def make_scene(ply: GaussianFile, placed: Placed, hints: ReadHints) -> Loaded:
 
     The scene has no larger photos and no masks yet, see :func:`add_larger_and_masks`.
     """
-    files, result, source = placed.files, placed.result, placed.source
+    files = placed.files
+    result = placed.result
+    source = placed.source
     absent = [] if source is None else source.photos.absent
-    camera_file, recovery = result.camera_file, result.recovery
+    camera_file = result.camera_file
+    recovery = result.recovery
     gaussians, pixels = take_gaussians(ply, result)
     num_faint = int(ply.valid.sum()) - len(gaussians)
     faint = count_words(num_faint, "Gaussian", "fainter than 1/255, which nothing draws, set aside")
@@ -143,7 +146,10 @@ def add_larger_and_masks(load: Loaded) -> Loaded:
     Masks that were found, but cannot be used, are left out with a note. Raises SceneError for masks that the caller
     named, and for masks that the camera file lists if they are photos.
     """
-    files, source, scene, notes = load.files, load.source, load.scene, list[str]()
+    files = load.files
+    source = load.source
+    scene = load.scene
+    notes = list[str]()
     if source is None:
         return load
     is_plain = "masks" in files.named and files.masks is None  # the user wants no masks

@@ -139,8 +139,10 @@ def read_files(files: SceneFiles, *, opacity: OpacityChoice = "auto", hints: Rea
     from gsmerge.reading.alignment.registration.join import join_scenes
 
     joined = join_scenes([load.scene for load in loads], [load.files.ply for load in loads])
-    scene, used = joined.scene, [loads[i] for i in joined.used]
-    notes, choices = list[str](), list[Choice]()
+    scene = joined.scene
+    used = [loads[i] for i in joined.used]
+    notes = list[str]()
+    choices = list[Choice]()
     for name, load in zip(joined.names, loads, strict=True):
         notes += name_notes(name, load.notes)
         choices += [replace(choice, path=f"{name}: {choice.path}") for choice in load.candidates]
@@ -185,7 +187,8 @@ def find_views(
     Cameras and photos that were found, but do not belong to the scene, are left out with a note. With
     ``keeps_cameras``, cameras are not estimated in place of files. If ``photos`` is False, no photos are searched.
     """
-    candidates, tried = list_candidates(files, keeps_cameras=keeps_cameras), list[Evidence]()
+    candidates = list_candidates(files, keeps_cameras=keeps_cameras)
+    tried = list[Evidence]()
     for candidate in candidates:
         views = parse_views(ply, candidate, photos=photos) if is_needed(candidate, tried) else None
         if views is not None:
