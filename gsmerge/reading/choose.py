@@ -61,8 +61,10 @@ def is_needed(candidate: Candidate, tried: Sequence[Evidence]) -> bool:
     best = choose(tried)
     if best is not None:
         return best.own_views > best.num_views
-    blames_photos = "images" in files.named and Path(find_cause(tried).path).is_relative_to(files.images or files.ply)
-    return "cameras" not in files.named and not blames_photos
+    photos_are_to_blame = False
+    if "images" in files.named:
+        photos_are_to_blame = Path(find_cause(tried).path).is_relative_to(files.images or files.ply)
+    return "cameras" not in files.named and not photos_are_to_blame
 
 
 def certainly_fits(evidence: Evidence) -> bool:
@@ -70,7 +72,7 @@ def certainly_fits(evidence: Evidence) -> bool:
 
     - With photos, it does if rows are its pixels, if the photos show its views, or if there are no other cameras.
     - Without photos, it does if no other cameras lie in folders below the scene, and if rows are its pixels or the
-      scene has no doubts.
+      scene has no doubts. Cameras in folders below may be those of another scene, which only photos can show.
     """
     files = evidence.files
     if evidence.error is not None:
@@ -89,14 +91,19 @@ def choose(tried: Sequence[Evidence]) -> Evidence | None:
     files = tried[0].files
     fitting = [one for one in tried if one.error is None and not one.candidate.replaces_files]
     best = next(filter(certainly_fits, fitting), fitting[0] if fitting else None)
-    rows = tried[-1]
-    lacks_photos = not rows.has_photos and "images" in files.named and files.images is not None
-    if not rows.candidate.replaces_files or rows.error is not None or lacks_photos:
+    rows = tried[-1] if tried[-1].candidate.replaces_files else None
+    if rows is None or rows.error is not None or lacks_named_photos(rows):
         return best
-    missing = describe_missing(rows.names, tried[0].stored, is_right=best is not None)
+    missing = describe_missing(rows.names, (best or tried[0]).stored, is_right=best is not None)
     if missing is not None:
         return replace(rows, notes=(missing, *split_notes(rows.notes, "estimated cameras")[1]))
     return best or leave_out(rows, files, [str(files.cameras)], find_cause(tried))
+
+
+def lacks_named_photos(evidence: Evidence) -> bool:
+    """Return whether photos that the caller named cannot be used with a candidate."""
+    files = evidence.files
+    return not evidence.has_photos and "images" in files.named and files.images is not None
 
 
 def release_spare(evidence: Evidence, earlier: Sequence[Evidence]) -> Evidence:
@@ -111,7 +118,7 @@ def find_cause(tried: Sequence[Evidence]) -> SceneError:
     return next(one.error for one in tried if one.error is not None)
 
 
-def find_best(tried: Sequence[Evidence]) -> Evidence:
+def find_most_seen(tried: Sequence[Evidence]) -> Evidence:
     """Return the candidate whose cameras see most of the Gaussians, or the first if none was measured."""
     return max(tried, key=lambda one: -1.0 if one.sight is None else one.sight.score)
 
@@ -119,12 +126,12 @@ def find_best(tried: Sequence[Evidence]) -> Evidence:
 def explain_refusal(tried: Sequence[Evidence]) -> SceneError:
     """Return what spoke against the best candidate, if none is chosen, with what the user can do."""
     files = tried[0].files
-    best = find_best(tried)
+    best = find_most_seen(tried)
     cause = best.error or find_cause(tried)
     cameras = best.files.cameras
     problem = cause.problem
     if len(tried) > 1 and cameras is not None and cause.path != str(cameras):
-        num_files = sum(one.files.cameras is not None for one in tried)
+        num_files = len({one.files.cameras for one in tried if one.files.cameras is not None})
         rank = f", the best of {num_files} camera files" if num_files > 1 else ""
         problem += f" (cameras: {cameras}{rank})"
     options = [f"--{name} {NONE}" for name in ("cameras", "images") if name in files.named and getattr(files, name)]
@@ -143,8 +150,9 @@ def choose_photos(shown: Evidence, bare: Evidence, views: Views) -> Evidence:
     folder = views.place
     if cause is None or bare.error is not None:
         return shown
-    is_photo = Path(cause.path).suffix.lower() in IMAGE_SUFFIXES or cause.path == str(folder) or not views.photos.named
-    if not (bare.are_pixels or is_photo or views.photos.by_names):
+    is_photo = Path(cause.path).suffix.lower() in IMAGE_SUFFIXES
+    concerns_photos = is_photo or cause.path == str(folder) or not views.photos.named
+    if not (bare.are_pixels or concerns_photos or views.photos.by_names):
         return shown
     left_out = leave_out(bare, replace(views.files, images=folder), [f"the photos in {folder}"], cause)
     return replace(left_out, photo_error=cause)
@@ -169,16 +177,17 @@ def blames_photos(shown: Evidence, views: Views) -> bool:
 def give_reasons(
     candidates: Sequence[Candidate], tried: Sequence[Evidence], chosen: Evidence | None
 ) -> tuple[Choice, ...]:
-    """Say of all cameras, and of the photos of the chosen cameras, whether they were chosen and why.
+    """Say of all camera files, and of the photos of the chosen cameras, whether they were chosen and why.
 
-    If no cameras were chosen, the photos are those of the cameras that a refusal is about.
+    Cameras of the rows, and other ways of reading a file, are named if they were examined. If no cameras were chosen,
+    the photos are those of the cameras that a refusal is about.
     """
     files = candidates[0].files
     choices = list[Choice]()
     evidence_on = {one.candidate: one for one in tried}
     for candidate in candidates:
         one = evidence_on.get(candidate)
-        if one is not None:
+        if one is not None and not (files.is_state and one.files.cameras is None):
             is_chosen = chosen is not None and chosen.candidate is candidate and one.num_views > 0
             reason, can_be_named = _judge(one, chosen)
             place = _name_cameras(one)
@@ -194,7 +203,7 @@ def give_reasons(
     for kind, path in files.above:
         reason = "outside the scene's folder"
         choices.append(make_choice(files, {"images": "photos"}.get(kind, kind), path, reason, chosen=False))
-    return (*choices, *_judge_photos(chosen or find_best(tried), files))
+    return (*choices, *_judge_photos(chosen or find_most_seen(tried), files))
 
 
 def _judge_photos(best: Evidence, files: SceneFiles) -> list[Choice]:
@@ -235,7 +244,8 @@ def _judge(one: Evidence, chosen: Evidence | None) -> tuple[str, bool]:
     Also return whether an option that names them would take them.
     """
     if one.error is not None:
-        if one.photo_place is not None and Path(one.error.path).is_relative_to(one.photo_place):
+        are_named = "images" in one.files.named and one.photo_place not in (None, one.files.cameras)
+        if are_named and Path(one.error.path).is_relative_to(one.photo_place or ""):
             return "the photos that were named do not show their views", False
         return one.error.problem if one.sight is None else one.sight.words, False
     if one.num_views == 0:
@@ -247,6 +257,8 @@ def _judge(one: Evidence, chosen: Evidence | None) -> tuple[str, bool]:
         fact = f"see {100 * one.sight.share_seen:.0f} % of the Gaussians"
     if one.stored is not None and one.stored.source == ESTIMATED:
         fact = f"the Gaussians form {one.num_views} views: {fact}"
+    if one.candidate.replaces_files and lacks_named_photos(one):
+        return f"{fact}, but the photos that were named do not show them", False
     if chosen is not None and one.candidate is not chosen.candidate and chosen.candidate.replaces_files:
         return f"{fact}, but they are {one.num_views}, and the Gaussians form {chosen.num_views} views", False
     is_shown = one.photo_error is None and (one.are_pixels or one.has_photos or one.photo_place is None)

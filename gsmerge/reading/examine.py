@@ -1,6 +1,6 @@
 """Examine candidates: what shows that cameras, and the photos beside them, belong to the Gaussians, or do not.
 
-Nothing here raises a SceneError, since an error is evidence, too.
+:func:`examine` raises no SceneError, since an error is evidence, too.
 """
 
 from __future__ import annotations

@@ -200,7 +200,7 @@ def add_larger_and_masks(load: Loaded) -> Loaded:
 
 
 def _with_choice(error: SceneError, load: Loaded, place: Path | str | None, reason: str) -> SceneError:
-    """Return an error about masks with what was tried, the masks among it."""
+    """Put what was tried, the masks among it, into an error about masks, and return the error."""
     error.candidates = load.candidates
     if place is not None:
         choice = make_choice(load.files, "masks", place, reason, chosen=False, can_be_named=False)

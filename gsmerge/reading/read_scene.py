@@ -196,8 +196,10 @@ def find_views(
     chosen = choose(tried)
     choices = give_reasons(candidates, tried, chosen)
     if chosen is None or chosen.load is None:
+        # a hint on the order of rows that have none explains more than cameras that were found
         refused = None if "cameras" in files.named else attempt(check_hints, ply, hints)
         return Reading(refused or explain_refusal(tried), choices)
+    # the first file needs no note, unless it was confirmed against others
     is_usual = chosen.files.cameras == files.cameras and not certainly_fits(chosen)
     on_choice = [] if is_usual else files.describe_choice(chosen.files.cameras)
     notes = (*on_choice, *chosen.notes)
@@ -222,6 +224,7 @@ def move_cameras_to_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHi
     If ``photos`` is True, named photos that cannot be read raise SceneError. Named cameras without a size raise
     SceneError, too.
     """
+    # Errors of these attempts are lost, as the last call finds them again, or a way without the files
     for with_photos in dict.fromkeys((True, photos)):  # photos help to find the frame even if they are not needed
         moved = attempt(finish, find_views(ply, files, hints, photos=with_photos, keeps_cameras=True))
         if not isinstance(moved, SceneError):

@@ -277,13 +277,25 @@ def test_every_candidate_has_a_reason_and_an_option() -> None:
           (True, "the Gaussians form 4 views: 100.0 % of the Gaussians lie near their pixels")]),
         ([fails(), fails(CAMERAS[1]), Evidence(ROWS)], 2,
          [(False, DAMAGED.problem), (False, DAMAGED.problem), (False, "the Gaussians form no grid of pixels")]),
-        ([fails(error=OTHER_PHOTOS, photo_place=IMAGES), fails(CAMERAS[1])], None,
-         [(False, "the photos that were named do not show their views"), (False, DAMAGED.problem)]),
     ],
 )  # fmt: skip
 def test_cameras_have_a_reason(tried: list[Evidence], chosen: int | None, expected: list[tuple[bool, str]]) -> None:
     choices = give_reasons(CAMERAS, tried, None if chosen is None else tried[chosen])
     assert [(one.chosen, one.reason) for one in choices if one.kind == "cameras"] == expected
+
+
+def test_photos_that_the_caller_named_are_the_reason_of_cameras_and_rows() -> None:
+    candidates = list_candidates(replace(FILES, named=frozenset({"images"})))
+    first = fails(candidates[0], OTHER_PHOTOS, photo_place=IMAGES)
+    rows = fits(candidates[-1], num_views=4, share_near=1.0, stored=ESTIMATED_CAMERAS)
+    reasons = [one.reason for one in give_reasons(candidates, [first, rows], None) if one.kind == "cameras"]
+    assert reasons[0] == "the photos that were named do not show their views"
+    assert reasons[-1].endswith("but the photos that were named do not show them")
+
+
+def test_a_state_without_cameras_has_no_candidate_of_rows() -> None:
+    candidates = list_candidates(SceneFiles(FOLDER / "a.gsm", None, None))
+    assert give_reasons(candidates, [Evidence(candidates[0])], None) == ()
 
 
 @pytest.mark.parametrize(
