@@ -13,16 +13,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsmerge.errors import Doubt
-from gsmerge.geometry.transforms import sh0_to_rgb
-from gsmerge.geometry.views import camera_kinds
-from gsmerge.kernels.pictures import convolve
-from gsmerge.prepare.photo_change import PhotoChange, change_large
-from gsmerge.prepare.row_colors import RowPicture, fill_gaps, picture_rows
-from gsmerge.raster import render
-from gsmerge.raster.photos import counting_pixels, row_pictures
-from gsmerge.reading.photos.assign_photos import Assigner, Candidates
-from gsmerge.reading.photos.colors import (
+from gsmerge.compare.assign_photos import Assigner, Candidates
+from gsmerge.compare.colors import (
     EXPOSURE_STEP,
     VISIBLE,
     cut_blocks,
@@ -37,15 +29,16 @@ from gsmerge.reading.photos.colors import (
     tone_blocks,
     vary_in_hue,
 )
-from gsmerge.reading.photos.similarity import stands_out
-from gsmerge.reading.photos.view_pictures import (
-    PICTURE_PIXELS,
-    Pairs,
-    ViewPictures,
-    draw_canonical,
-    pair_photos,
-    show_views,
-)
+from gsmerge.compare.similarity import stands_out
+from gsmerge.compare.view_pictures import PICTURE_PIXELS, Pairs, ViewPictures, draw_canonical, pair_photos, show_views
+from gsmerge.errors import Doubt
+from gsmerge.geometry.transforms import sh0_to_rgb
+from gsmerge.geometry.views import camera_kinds
+from gsmerge.kernels.pictures import convolve
+from gsmerge.prepare.photo_change import PhotoChange, change_large
+from gsmerge.prepare.row_colors import RowPicture, fill_gaps, picture_rows
+from gsmerge.raster import render
+from gsmerge.raster.photos import counting_pixels, row_pictures
 from gsmerge.runtime.record import list_some, note, record_choices
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.stages import Look
@@ -206,7 +199,7 @@ def _group_by_curve(pairs: Pairs, views: Sequence[int]) -> list[list[int]]:
 def find_matching_views(
     scene: PicturedScene, views: Sequence[int], photos: Sequence[np.ndarray], shown: ViewPictures
 ) -> list[int]:
-    """Find which of ``views`` are shown by their ``photos [h,w,3]``; see :mod:`gsmerge.reading.photos.assign_photos`.
+    """Find which of ``views`` are shown by their ``photos [h,w,3]``; see :mod:`gsmerge.compare.assign_photos`.
 
     No view is returned if all photos together match their views no better than photos match other views. Views of one
     camera share one photo. ``shown`` are small pictures of the Gaussians in all views, which are reused if they are

@@ -7,6 +7,10 @@ from math import prod
 
 import numpy as np
 
+from gsmerge.compare.colors import cut_blocks
+from gsmerge.compare.offsets import OFFSET_PIXELS
+from gsmerge.compare.similarity import stands_out
+from gsmerge.compare.view_pictures import Pairs, show_views
 from gsmerge.errors import Note, split_notes
 from gsmerge.geometry.transforms import camera_depths, rgb_to_sh0, sh0_to_rgb
 from gsmerge.io.formats.read_gaussians import GaussianFile
@@ -14,10 +18,6 @@ from gsmerge.io.formats.units import RGB_NOTE
 from gsmerge.raster.photos import LEAST_OPACITY, shrink_pictures
 from gsmerge.reading.alignment import AlignmentResult
 from gsmerge.reading.loaded import Loaded
-from gsmerge.reading.photos.colors import cut_blocks
-from gsmerge.reading.photos.offsets import OFFSET_PIXELS
-from gsmerge.reading.photos.similarity import stands_out
-from gsmerge.reading.photos.view_pictures import Pairs, show_views
 from gsmerge.types import Gaussians, Pixels
 
 _BLOCK = 1 << 20  # numbers that are compared at once

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from gsmerge.compare.view_pictures import ViewPictures
 from gsmerge.kernels.pictures import blur
 from gsmerge.raster.photos import shrink_pictures
-from gsmerge.reading.photos.view_pictures import ViewPictures
 
 WIDTH, HEIGHT, STEP = 256, 192, 48  # pixels of a view, and between two
 

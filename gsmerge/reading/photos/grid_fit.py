@@ -13,13 +13,13 @@ from typing import TypeVar
 
 import numpy as np
 
+from gsmerge.compare.offsets import correlate_parts
+from gsmerge.compare.similarity import stands_out
+from gsmerge.compare.view_pictures import ViewPictures
 from gsmerge.frozen import dataclass, replace
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.photo_files import WHOLE, Part, PhotoTransform, Size, cut_part, part_size, resize_and_crop, resize_to
 from gsmerge.reading.alignment import TRIMS
-from gsmerge.reading.photos.offsets import correlate_parts
-from gsmerge.reading.photos.similarity import stands_out
-from gsmerge.reading.photos.view_pictures import ViewPictures
 
 
 @dataclass(frozen=True)

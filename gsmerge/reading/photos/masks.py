@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from gsmerge.compare.offsets import OFFSET_PIXELS
 from gsmerge.errors import Doubt, SceneError
 from gsmerge.frozen import dataclass
 from gsmerge.geometry.transforms import is_inside, project
@@ -27,7 +28,6 @@ from gsmerge.io.photo_files import (
     same_shape,
 )
 from gsmerge.kernels.pictures import turn_picture
-from gsmerge.reading.photos.offsets import OFFSET_PIXELS
 from gsmerge.reading.photos.scene_photos import ScenePhotos, is_grey
 from gsmerge.reading.scene_files import SceneFiles
 from gsmerge.runtime.record import list_some

@@ -10,6 +10,9 @@ from itertools import product
 
 import numpy as np
 
+from gsmerge.compare.assign_photos import Assigner, Assignment, Candidates
+from gsmerge.compare.offsets import OFFSET_PIXELS
+from gsmerge.compare.view_pictures import show_views
 from gsmerge.errors import SceneError, attempt
 from gsmerge.frozen import replace
 from gsmerge.geometry.views import pick_views
@@ -29,11 +32,8 @@ from gsmerge.io.photo_files import (
     same_shape,
 )
 from gsmerge.kernels.pictures import count_bars
-from gsmerge.reading.photos.assign_photos import Assigner, Assignment, Candidates
 from gsmerge.reading.photos.grid_fit import WHOLE_FIT, GridFit, PartFit, choose_fit
-from gsmerge.reading.photos.offsets import OFFSET_PIXELS
 from gsmerge.reading.photos.scene_photos import ScenePhotos
-from gsmerge.reading.photos.view_pictures import show_views
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Scene
 

@@ -13,12 +13,7 @@ from messages import noted
 from panoramas import cut_views, shrunk
 
 from gsmerge import CompactResult, Scene, compact, render
-from gsmerge.geometry.transforms import rgb_to_sh0, sh0_to_rgb
-from gsmerge.prepare.compare_photos import are_exchanged, compare_photos, find_grey, have_other_tones
-from gsmerge.prepare.photo_change import LUMA, PhotoChange
-from gsmerge.prepare.prepare_scene import prepare
-from gsmerge.prepare.row_colors import PHOTOS, ROW_COLORS
-from gsmerge.reading.photos.colors import (
+from gsmerge.compare.colors import (
     Blocks,
     cut_blocks,
     explains,
@@ -31,7 +26,12 @@ from gsmerge.reading.photos.colors import (
     tone_blocks,
     vary_in_hue,
 )
-from gsmerge.reading.photos.view_pictures import Pairs, ViewPictures
+from gsmerge.compare.view_pictures import Pairs, ViewPictures
+from gsmerge.geometry.transforms import rgb_to_sh0, sh0_to_rgb
+from gsmerge.prepare.compare_photos import are_exchanged, compare_photos, find_grey, have_other_tones
+from gsmerge.prepare.photo_change import LUMA, PhotoChange
+from gsmerge.prepare.prepare_scene import prepare
+from gsmerge.prepare.row_colors import PHOTOS, ROW_COLORS
 from gsmerge.runtime.record import record_run
 from gsmerge.types import PicturedScene
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from panoramas import cut_views, show, shrunk, take_photos
 
+from gsmerge.compare.assign_photos import FIRST_PHOTOS, Assigner, Assignment, Candidates, assign_photos
+from gsmerge.compare.offsets import OFFSET_PIXELS, find_offsets
 from gsmerge.kernels.pictures import blur, turn_back
-from gsmerge.reading.photos.assign_photos import FIRST_PHOTOS, Assigner, Assignment, Candidates, assign_photos
-from gsmerge.reading.photos.offsets import OFFSET_PIXELS, find_offsets
 
 VIEWS = 6
 Named = Sequence[int | None]

@@ -11,11 +11,11 @@ from functools import cached_property
 
 import numpy as np
 
+from gsmerge.compare.similarity import NOISE_MARGIN, find_contrast, fisher_z
+from gsmerge.compare.view_pictures import ViewPictures
 from gsmerge.frozen import dataclass
 from gsmerge.geometry.transforms import NORMAL_SPREAD
 from gsmerge.raster.photos import shrink_pictures
-from gsmerge.reading.photos.similarity import NOISE_MARGIN, find_contrast, fisher_z
-from gsmerge.reading.photos.view_pictures import ViewPictures
 
 OFFSET_PIXELS = 256  # pixels of the longer side of both pictures
 PART_PIXELS, MOST_OFFSET = 32, 12  # pixels: side of a part, and largest offset that is searched

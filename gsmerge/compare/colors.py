@@ -13,10 +13,10 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from gsmerge.compare.similarity import stands_out
+from gsmerge.compare.view_pictures import Pairs
 from gsmerge.frozen import dataclass
 from gsmerge.kernels.matrices import matmul, solve
-from gsmerge.reading.photos.similarity import stands_out
-from gsmerge.reading.photos.view_pictures import Pairs
 from gsmerge.runtime.threads import parallel_map
 
 BLOCKS = 12  # along the longer side

@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 from panoramas import cut_views, show, take_photos
 
-from gsmerge.kernels.pictures import ORIENTATIONS, turn_back, turn_picture
-from gsmerge.raster.photos import shrink_pictures
-from gsmerge.reading.photos.similarity import (
+from gsmerge.compare.similarity import (
     NOISE_MARGIN,
     SCORE_PIXELS,
     Comparer,
@@ -18,7 +16,9 @@ from gsmerge.reading.photos.similarity import (
     signed_ranks,
     stands_out,
 )
-from gsmerge.reading.photos.view_pictures import ViewPictures, average, fit_size
+from gsmerge.compare.view_pictures import ViewPictures, average, fit_size
+from gsmerge.kernels.pictures import ORIENTATIONS, turn_back, turn_picture
+from gsmerge.raster.photos import shrink_pictures
 
 
 def correlate_slowly(shown: ViewPictures, view: int, upright: np.ndarray) -> float:

@@ -20,12 +20,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gsmerge.compare.offsets import NEAR_PIXELS, OFFSET_PIXELS, ZERO_OFFSET, PhotoOffsets, find_offsets
+from gsmerge.compare.similarity import NOISE_MARGIN, SCORE_PIXELS, Comparer, fisher_z, measure_noise
+from gsmerge.compare.view_pictures import ViewPictures
 from gsmerge.frozen import dataclass, replace
 from gsmerge.geometry.transforms import median
 from gsmerge.kernels.pictures import turn_picture
-from gsmerge.reading.photos.offsets import NEAR_PIXELS, OFFSET_PIXELS, ZERO_OFFSET, PhotoOffsets, find_offsets
-from gsmerge.reading.photos.similarity import NOISE_MARGIN, SCORE_PIXELS, Comparer, fisher_z, measure_noise
-from gsmerge.reading.photos.view_pictures import ViewPictures
 from gsmerge.runtime.threads import parallel_map
 
 SIGNIFICANT = 2.0  # standard deviations of noise; smaller scores and smaller differences of scores count as noise

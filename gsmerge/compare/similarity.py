@@ -13,13 +13,13 @@ from functools import cached_property
 
 import numpy as np
 
+from gsmerge.compare.view_pictures import ViewPictures, fit_size
 from gsmerge.frozen import dataclass
 from gsmerge.geometry.transforms import NORMAL_SPREAD, median
 from gsmerge.kernels.elementary import log
 from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.pictures import ORIENTATIONS, blur, turn_back
 from gsmerge.raster.photos import LEAST_OPACITY, shrink_pictures
-from gsmerge.reading.photos.view_pictures import ViewPictures, fit_size
 
 SCORE_PIXELS = (24, 64)  # pixels of the longer side at which pictures are compared
 PICTURE_SPREADS = 6  # side of a picture, in standard deviations of the blur that gives the local mean

@@ -1,0 +1,1 @@
+"""Compare pictures in memory: photos with what Gaussians show."""
