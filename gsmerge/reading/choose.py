@@ -17,8 +17,9 @@ from gsmerge.reading.candidates import Candidate, Views
 from gsmerge.reading.choice import ESTIMATED_CAMERAS, Choice, make_choice
 from gsmerge.reading.loaded import Loaded
 from gsmerge.reading.photos.scene_photos import MismatchError, describe_missing
-from gsmerge.reading.scene_files import SceneFiles
+from gsmerge.reading.scene_files import KINDS, SceneFiles
 from gsmerge.settings.reading import NONE
+from gsmerge.types import Scene
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +47,12 @@ class Evidence:
     def files(self) -> SceneFiles:
         """The scene's files with these cameras."""
         return self.candidate.files
+
+    @property
+    def scene(self) -> Scene:
+        """The scene with the candidate, which is there if there is no error and no other candidate is chosen."""
+        assert self.load is not None, "a candidate without an error has a scene"
+        return self.load.scene
 
 
 def is_needed(candidate: Candidate, tried: Sequence[Evidence]) -> bool:
@@ -200,9 +207,9 @@ def give_reasons(
     for path in files.others if files.is_spread else ():
         reason = "several folders have cameras, which may be those of several scenes"
         choices.append(make_choice(files, "cameras", path, reason, chosen=False))
-    for kind, path in files.above:
+    for option, path in files.above:
         reason = "outside the scene's folder"
-        choices.append(make_choice(files, {"images": "photos"}.get(kind, kind), path, reason, chosen=False))
+        choices.append(make_choice(files, KINDS.get(option, option), path, reason, chosen=False))
     return (*choices, *_judge_photos(chosen or find_most_seen(tried), files))
 
 

@@ -119,7 +119,6 @@ class PhotoTrial:
     """A scene with the photos that names propose, or without photos, and the photos that show its views."""
 
     base: Evidence  # on the scene
-    load: Loaded  # the scene
     proposed: ScenePhotos  # without the photos that turned out to be damaged
     checked: ScenePhotos  # the photo of each view, by content
     error: SceneError | None  # why the scene does not have the proposed photos
@@ -143,11 +142,10 @@ def _try_photos(
         base = measure_bare(camera_file)
     if base.error is not None:
         raise error or base.error
-    assert base.load is not None, "a candidate without an error has a scene"
-    if are_read and base.load.source is not None:
+    if are_read and base.load is not None and base.load.source is not None:
         photos = photos.without_files(base.load.source.photos.damaged)
-    checked = assign_to_views(base.load.scene, photos, camera_file, read=are_read)
-    return PhotoTrial(base, base.load, photos, checked, error, are_read)
+    checked = assign_to_views(base.scene, photos, camera_file, read=are_read)
+    return PhotoTrial(base, photos, checked, error, are_read)
 
 
 def _examine_photos(
@@ -166,14 +164,14 @@ def _examine_photos(
     shapes_differ = not is_without_names(camera_file) and has_other_shape(photos, camera_file)
     part = None
     if shapes_differ:  # 1.
-        bare = measure_bare(camera_file).load
-        found = None if bare is None else attempt(choose_part, bare.scene, photos, camera_file)
+        bare = measure_bare(camera_file)
+        found = None if bare.error is not None else attempt(choose_part, bare.scene, photos, camera_file)
         part = found if isinstance(found, ScenePhotos) else None
     trial = _try_photos(measure, measure_bare, camera_file, part or photos)  # 2.
     if part is None and not shapes_differ:  # 3.
-        shows_most = trial.checked.explain_most and not has_bars(trial.load.scene.images)
+        shows_most = trial.checked.explain_most and not has_bars(trial.base.scene.images)
         fit = trial.checked.grid_fit
-        part = None if shows_most else choose_part(trial.load.scene, trial.proposed, camera_file, fit)
+        part = None if shows_most else choose_part(trial.base.scene, trial.proposed, camera_file, fit)
         trial = trial if part is None else _try_photos(measure, measure_bare, camera_file, part)
     checked = trial.checked
     evidence = trial.base

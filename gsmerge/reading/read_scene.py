@@ -6,7 +6,7 @@ import warnings
 from typing import Any
 
 from gsmerge.errors import Doubt, DoubtWarning, SceneError, attempt, name_notes
-from gsmerge.frozen import dataclass, replace
+from gsmerge.frozen import replace
 from gsmerge.io.cameras.camera_file import to_cameras
 from gsmerge.io.formats.read_gaussians import GaussianFile, read_gaussians, read_parts
 from gsmerge.io.photo_files import NO_IMAGES, as_floats, photo_size
@@ -35,14 +35,6 @@ from gsmerge.settings.reading import OpacityChoice
 from gsmerge.types import Scene, StrPath
 
 SUMMED_FACTS = ("file_bytes", "num_nonfinite")  # facts about files that are added up if scenes are joined
-
-
-@dataclass(frozen=True, eq=False)
-class Reading:
-    """What was decided about the cameras and photos of a scene."""
-
-    outcome: Loaded | SceneError  # the scene, or why no cameras fit
-    candidates: tuple[Choice, ...]  # all cameras and photos that may belong to it, and why they were chosen or left out
 
 
 @check_arguments
@@ -180,9 +172,10 @@ def find_views(
     *,
     photos: bool = True,
     keeps_cameras: bool = False,
-) -> Reading:
-    """Find the cameras and photos of Gaussians, and the pixel of every row if rows have pixels.
+) -> Loaded | SceneError:
+    """Find the cameras and photos of Gaussians, and the pixel of every row if rows have pixels; or say why none fit.
 
+    Both the scene and the error have the ``candidates``, with the reason why each was chosen or left out.
     Candidates for the cameras are examined in order, as long as they are needed, and one is chosen by the evidence.
     Cameras and photos that were found, but do not belong to the scene, are left out with a note. With
     ``keeps_cameras``, cameras are not estimated in place of files. If ``photos`` is False, no photos are searched.
@@ -198,23 +191,24 @@ def find_views(
     if chosen is None or chosen.load is None:
         # a hint on the order of rows that have none explains more than cameras that were found
         refused = None if "cameras" in files.named else attempt(check_hints, ply, hints)
-        return Reading(refused or explain_refusal(tried), choices)
+        error = refused or explain_refusal(tried)
+        error.candidates = choices
+        return error
     # the first file needs no note, unless it was confirmed against others
     is_usual = chosen.files.cameras == files.cameras and not certainly_fits(chosen)
     on_choice = [] if is_usual else files.describe_choice(chosen.files.cameras)
     notes = (*on_choice, *chosen.notes)
-    return Reading(replace(chosen.load, notes=notes, photos_explain=chosen.photos_explain), choices)
+    return replace(chosen.load, notes=notes, photos_explain=chosen.photos_explain, candidates=choices)
 
 
-def finish(reading: Reading) -> Loaded:
-    """Return the scene that was chosen, with confirmed colours, larger photos and masks; raise SceneError if none was.
+def finish(found: Loaded | SceneError) -> Loaded:
+    """Return the scene that was found, with confirmed colours, larger photos and masks; raise SceneError if none was.
 
     Also raises SceneError for masks that cannot be used, see :func:`add_larger_and_masks`.
     """
-    if isinstance(reading.outcome, SceneError):
-        reading.outcome.candidates = reading.candidates
-        raise reading.outcome
-    return add_larger_and_masks(replace(confirm_colors(reading.outcome), candidates=reading.candidates))
+    if isinstance(found, SceneError):
+        raise found
+    return add_larger_and_masks(confirm_colors(found))
 
 
 def move_cameras_to_scene(ply: GaussianFile, files: SceneFiles, *, hints: ReadHints, photos: bool) -> Loaded:

@@ -51,6 +51,7 @@ PLY_PLACES = ("scene.ply", "gaussians.ply", "gs_ply/0000.ply", "point_cloud.ply"
 # training is read
 TRAINED_PLACES = ("point_cloud/iteration_*/point_cloud.ply", "ply/point_cloud_*.ply")
 SCENES_PLACE = "gaussians"  # folder where DepthSplat and its relatives write NAME.ply; the photos are in images/NAME
+KINDS = {"images": "photos"}  # option -> kind of the files that it names, if users call the kind otherwise
 MASK_PLACES = ("masks", "keyframes/masks")
 _OTHER_PICTURES = {"masks", "targets"}  # folders of pictures that are no photos of the scene's views
 _POINT_CLOUDS = {"input.ply", "points3D.ply", "points.ply", "sparse_pc.ply"}  # names of point clouds of other programs
@@ -149,7 +150,7 @@ class SceneFiles:
         elif self.parts:
             notes.append(f"{len(self.parts)} files are read as one scene: {self.ply.name} to {self.parts[-1].name}")
         if self.above:
-            kinds = " and ".join({"images": "photos"}.get(option, option) for option, _ in self.above)
+            kinds = " and ".join(KINDS.get(option, option) for option, _ in self.above)
             words = shlex.join(word for option, path in self.above for word in (f"--{option}", str(path)))
             notes.append(f"{kinds} outside the scene's folder are not read; to read them, pass {words}")
         if self.below and self.cameras not in self.others:

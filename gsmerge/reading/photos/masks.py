@@ -212,10 +212,10 @@ def _doubt_mask(mask: Path, photos: PhotoArrays, view: int) -> float:
     photo for certain. A grey picture may be a photo if it changes from pixel to pixel as the photo of its view does. If
     most pixels of a picture have one of two levels, it is a mask with soft edges and no photo.
     """
-    if _read_cutout(mask) is not None:
-        return 0
     picture = np.rint(decode_small(mask, OFFSET_PIXELS) * _WHITE)
     spread = np.ptp(picture, axis=-1)
+    if spread.mean() > 1 and decode_alpha(mask) is not None:
+        return 0
     if spread.mean() > 1:
         colors = picture[spread >= spread.max() / 2]
         return np.inf if np.median(np.abs(colors - np.median(colors, 0)).max(1)) > 1 else 0
