@@ -175,7 +175,7 @@ def compact_scene(scene: Scene, options: CompactOptions) -> CompactResult:
         note(f"budget {budget.budget}: the input has only {size.num_gaussians:,} Gaussians, so the result has no more")
     num_blocks = choose_blocks(size, options)
     if num_blocks > 1:
-        from gsmerge.special.blocks.compact_blocks import compact_in_blocks
+        from gsmerge.blocks.compact_blocks import compact_in_blocks
 
         result = compact_in_blocks(scene, options, size, num_blocks)
         if result is not None:  # the views are worth several blocks
@@ -189,7 +189,7 @@ def compact_scene(scene: Scene, options: CompactOptions) -> CompactResult:
 def plan_run(scene: Scene, options: CompactOptions) -> tuple[Prepared, Plan]:
     """Prepare a scene, and plan its run."""
     if options.method != OURS:
-        from gsmerge.special.methods import choose_method
+        from gsmerge.plan.methods import choose_method
 
         method = choose_method(options, scene)
         prepared = method.prepare(scene.numpy(), options.prepare)
@@ -203,26 +203,26 @@ def plan_run(scene: Scene, options: CompactOptions) -> tuple[Prepared, Plan]:
 def compact_prepared(prepared: Prepared, plan: Plan) -> CompactResult:
     """Build the Gaussians of a prepared scene as the plan says, in one piece, and score them."""
     if plan.count.keeps_fidelity or prepared.reference.name == RENDERS:
-        from gsmerge.special.search import add_target
+        from gsmerge.counts.search import add_target
 
         plan = add_target(plan, prepared)
     expect_parts(run_parts(prepared, plan))
     levels = list[Candidate]()
     if plan.searches:
-        from gsmerge.special.search import search_count
+        from gsmerge.counts.search import search_count
 
         best = search_count(prepared, plan)
     else:
         begin_part("build")
         best = score(build(prepared, plan, plan.count.limits.count), prepared, plan)
     if plan.count.levels > 1:
-        from gsmerge.special.search import build_levels
+        from gsmerge.counts.search import build_levels
 
         levels = build_levels(best, prepared, plan)
     begin_part("input")
     result = make_result(best, levels, prepared, plan)
     if plan.score.new_views:
-        from gsmerge.special.new_views import expect_new_views
+        from gsmerge.results.new_views import expect_new_views
 
         result = replace(result, report=expect_new_views(result.report, prepared, plan))
     return result

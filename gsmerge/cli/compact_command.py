@@ -121,12 +121,12 @@ def _compact_files(
 
     ``has_levels``: the user gave the number of levels.
     """
+    from gsmerge.blocks.partition import gaussians_at_once
     from gsmerge.io.formats.table import estimate_counts
     from gsmerge.io.formats.write import level_output
     from gsmerge.plan.blocks import wanted_blocks
     from gsmerge.results.outputs import name_outputs, settings_for
     from gsmerge.runtime.memory import memory_bytes, memory_problem
-    from gsmerge.special.blocks.partition import gaussians_at_once
 
     engine = settings.blocks.engine.engine
     if engine == "ray" and not run.dry_run:

@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from gsmerge.blocks.partition import gaussians_at_once
+from gsmerge.counts.curve import curve_counts
 from gsmerge.errors import count_words
 from gsmerge.frozen import dataclass
 from gsmerge.geometry.frame import canonicalise
@@ -17,6 +19,7 @@ from gsmerge.plan.blocks import choose_blocks
 from gsmerge.plan.counts import FIDELITY_LOSS, FIDELITY_PSNR, level_counts, resolve_budget
 from gsmerge.plan.forecast import TRIAL_SHARE, usual_builds
 from gsmerge.plan.make_plan import is_without_views, note_ignored, plan_scene
+from gsmerge.plan.methods import choose_method
 from gsmerge.plan.networks import load_networks
 from gsmerge.prepare.confirm_depths import confirm_depths
 from gsmerge.prepare.crop import crop_scene
@@ -32,9 +35,6 @@ from gsmerge.runtime.record import record_part, record_run
 from gsmerge.runtime.threads import available_threads, use_threads
 from gsmerge.scoring.coverage import shares_inside
 from gsmerge.settings.compact import OURS, CompactOptions
-from gsmerge.special.blocks.partition import gaussians_at_once
-from gsmerge.special.curve import curve_counts
-from gsmerge.special.methods import choose_method
 from gsmerge.types import Scene
 
 # Most Gaussians of a scene without cameras for which the search is run; it takes seconds

@@ -16,6 +16,10 @@ from scripts import load_script
 
 import gsmerge
 from gsmerge import types
+from gsmerge.blocks import compact_blocks as blocks
+from gsmerge.blocks import fit_seams as seams
+from gsmerge.blocks import partition
+from gsmerge.counts import curve
 from gsmerge.drawing import render_files as drawings
 from gsmerge.drawing.pages import data, splats
 from gsmerge.fit import outside, photo_sizes, schedule, stage
@@ -41,7 +45,7 @@ from gsmerge.reading.alignment import score as cameras_off
 from gsmerge.reading.alignment.registration import register
 from gsmerge.reading.held_out import read_held_out
 from gsmerge.reading.read_scene import load_scene
-from gsmerge.results import scores
+from gsmerge.results import new_views, scores
 from gsmerge.runtime import memory, work
 from gsmerge.scoring import fog
 from gsmerge.settings.budget import DEVICES
@@ -49,10 +53,6 @@ from gsmerge.settings.compact import RECIPES, method_names
 from gsmerge.settings.extend import ExtendOptions
 from gsmerge.settings.fit import FitOptions, Tuning
 from gsmerge.settings.stages import MAX_CHILDREN, SHARE, MatchOptions
-from gsmerge.special import curve, new_views
-from gsmerge.special.blocks import compact_blocks as blocks
-from gsmerge.special.blocks import fit_seams as seams
-from gsmerge.special.blocks import partition
 from gsmerge.stages import fit_pairs, sky
 
 ROOT = Path(__file__).parents[2]

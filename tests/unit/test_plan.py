@@ -14,6 +14,7 @@ from messages import noted
 from scenes import psnr_of
 
 from gsmerge import CompactOptions, Scene, compact
+from gsmerge.counts.search import MAX_BUILDS, add_target
 from gsmerge.errors import UsageError
 from gsmerge.fit import Fitted
 from gsmerge.geometry.frame import canonicalise
@@ -34,7 +35,6 @@ from gsmerge.results.candidate import score
 from gsmerge.runtime.record import record_run
 from gsmerge.settings.compact import EFFORT_NAMES as NAMES
 from gsmerge.settings.fit import GROW_STEPS
-from gsmerge.special.search import MAX_BUILDS, add_target
 from gsmerge.types import NO_CAMERAS, make_scene
 
 

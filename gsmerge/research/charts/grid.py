@@ -12,13 +12,13 @@ from typing import Any
 from gsmerge.errors import SceneError, UsageError
 from gsmerge.jobs.batch.find import find_scenes, main_file
 from gsmerge.jobs.content_hash import content_hash, digest, fill_template, list_files, list_photos, scene_name
+from gsmerge.plan.methods import find_method
 from gsmerge.reading.scene_files import SceneFiles, find_scene_files
 from gsmerge.research.charts.lines import SIZE_SETTINGS
 from gsmerge.research.charts.measure_run import ChartScene, RunRecord, describe_run
 from gsmerge.scoring.evaluate import INPUT, EvaluateOptions
 from gsmerge.settings.compact import OURS, CompactOptions
 from gsmerge.settings.setting import flat_settings
-from gsmerge.special.methods import find_method
 from gsmerge.version import __version__
 
 COMMON_SETTINGS = ("seed", "threads")  # used by all methods

@@ -16,10 +16,10 @@ from gsmerge.prepare.prepared import LEAST_VIEWS
 from gsmerge.reading.held_out import HeldOutViews, read_held_out
 from gsmerge.reading.read_scene import read_files
 from gsmerge.reading.scene_files import find_scene_files
+from gsmerge.results.left_out import choose_left_out
 from gsmerge.run import compact
 from gsmerge.scoring.evaluate import INPUT, EvaluateOptions, evaluate
 from gsmerge.settings.compact import CompactOptions
-from gsmerge.special.left_out import choose_left_out
 from gsmerge.types import Scene
 
 RUNS = "runs.jsonl"  # in the folder of a grid

@@ -10,6 +10,7 @@ import pytest
 import scenes
 
 from gsmerge import CompactOptions, Scene, compact
+from gsmerge.counts.clean_up import build_cleaned
 from gsmerge.fit import Fitted
 from gsmerge.geometry.transforms import (
     evaluate_harmonics,
@@ -26,7 +27,6 @@ from gsmerge.prepare.move_poses import CHANCE, move_poses
 from gsmerge.prepare.prepare_scene import prepare
 from gsmerge.raster import render
 from gsmerge.raster.metrics import psnr
-from gsmerge.special.clean_up import build_cleaned
 
 VIEWS = range(5)
 GLOSS = 0.2  # strength of a highlight's harmonics
@@ -148,7 +148,7 @@ def test_coarser_levels_have_the_cameras_of_the_finest(small: Scene) -> None:
 def test_clean_up_keeps_the_poses_of_the_fit(small: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     moved = replace(small.cameras, viewmats=small.cameras.viewmats + 0.01)
     fitted = Fitted(small.gaussians, moved, None)
-    monkeypatch.setattr("gsmerge.special.clean_up.build", lambda *_: fitted)
+    monkeypatch.setattr("gsmerge.counts.clean_up.build", lambda *_: fitted)
     options, prepared = CompactOptions().with_settings({"drop": "floaters"}), prepare(small)
     assert build_cleaned(prepared, make_plan(prepared, options), None).cameras is moved
 

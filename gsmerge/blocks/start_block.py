@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from gsmerge.blocks.partition import Block, Covisibility, owning_views
 from gsmerge.frozen import dataclass, replace
 from gsmerge.geometry.frame import Frame
 from gsmerge.pipeline import merge_views
@@ -15,7 +16,6 @@ from gsmerge.results.scores import measure_input
 from gsmerge.runtime.memory import free_pages, make_array
 from gsmerge.runtime.record import begin_part
 from gsmerge.settings.compact import CompactOptions
-from gsmerge.special.blocks.partition import Block, Covisibility, owning_views
 from gsmerge.types import Gaussians, Scene, SceneT
 
 IN_FILE = 1 << 24  # photos of a block with at least this many bytes are kept in a file

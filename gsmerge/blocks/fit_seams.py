@@ -7,6 +7,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 
+from gsmerge.blocks.start_block import BlockStart
 from gsmerge.fit import fit_scene, peak_weights
 from gsmerge.geometry.views import in_float64, subset
 from gsmerge.raster import make_splats, tile_view
@@ -17,7 +18,6 @@ from gsmerge.reading.alignment.registration.join import concat_scenes, concat_va
 from gsmerge.runtime.memory import free_pages, make_array
 from gsmerge.runtime.record import add_seconds, begin_part, record_choices, record_part, stage
 from gsmerge.runtime.threads import in_turn
-from gsmerge.special.blocks.start_block import BlockStart
 from gsmerge.types import Decoded, Gaussians, PicturedScene
 
 FOREIGN_SHARE = 0.1  # a Gaussian is at a seam if other blocks' views have more than this share of its blending weights

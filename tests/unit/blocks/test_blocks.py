@@ -12,6 +12,7 @@ from messages import names, refuses
 from sweeps import sweep
 
 from gsmerge import CompactOptions, EvaluateOptions, compact, evaluate
+from gsmerge.blocks.fit_seams import join_views
 from gsmerge.errors import UsageError
 from gsmerge.fit import FitJob, FitOptions, fit_gaussians
 from gsmerge.fit.photo_sizes import fit_photos
@@ -23,7 +24,6 @@ from gsmerge.prepare.scene_size import measure_size
 from gsmerge.runtime import memory
 from gsmerge.settings.budget import DEVICES
 from gsmerge.settings.fit import GROW_STEPS
-from gsmerge.special.blocks.fit_seams import join_views
 from gsmerge.types import Cameras, Gaussians, PicturedScene, Scene
 
 SETTINGS: dict[str, Any] = {"checkpoint": "none", "superpixels": "10%", "fit_steps": 10, "threads": 1}

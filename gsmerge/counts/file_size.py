@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from gsmerge.counts.clean_up import build_candidate
 from gsmerge.errors import UsageError
 from gsmerge.io.formats.rows import MIP_COMMENT, RESULT_COMMENT
 from gsmerge.io.formats.table import Contents, Format
@@ -12,7 +13,6 @@ from gsmerge.prepare.prepared import Prepared
 from gsmerge.results.candidate import Candidate, rescore
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.record import add_seconds
-from gsmerge.special.clean_up import build_candidate
 from gsmerge.stages.clean import faintest_dropped
 from gsmerge.types import Cameras, Gaussians
 

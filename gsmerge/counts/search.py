@@ -6,6 +6,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
+from gsmerge.counts.clean_up import build_candidate, clean_fitted, record_dropped
+from gsmerge.counts.curve import count_reaching, count_within, curve_counts, curve_knee, measure_curve
+from gsmerge.counts.file_size import meet_bytes
 from gsmerge.kernels.elementary import exp, log, power
 from gsmerge.pipeline import build
 from gsmerge.plan.counts import FIDELITY_LOSS, level_counts
@@ -14,6 +17,7 @@ from gsmerge.plan.plan import CountPlan, Plan
 from gsmerge.prepare.prepared import LEAST_VIEWS, Prepared
 from gsmerge.prepare.row_colors import PHOTOS, RENDERS
 from gsmerge.results.candidate import Candidate, score
+from gsmerge.results.left_out import LeftOut, choose_left_out, leave_out, mean_seen
 from gsmerge.results.scores import compares_all_pixels, may_leave_gaps, measure_input, measure_renders
 from gsmerge.runtime.record import (
     RunPart,
@@ -28,10 +32,6 @@ from gsmerge.runtime.record import (
     stage,
 )
 from gsmerge.settings.stages import CleanOptions
-from gsmerge.special.clean_up import build_candidate, clean_fitted, record_dropped
-from gsmerge.special.curve import count_reaching, count_within, curve_counts, curve_knee, measure_curve
-from gsmerge.special.file_size import meet_bytes
-from gsmerge.special.left_out import LeftOut, choose_left_out, leave_out, mean_seen
 from gsmerge.stages.segment import knee_count
 
 # The slope is the gain of PSNR (dB) per doubling of the count. Until two counts were built, a search assumes these

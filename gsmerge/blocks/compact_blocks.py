@@ -9,6 +9,18 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from gsmerge.blocks.fit_seams import fit_seams
+from gsmerge.blocks.partition import (
+    Block,
+    Covisibility,
+    count_factors,
+    gaussians_at_once,
+    measure_covisibility,
+    partition_apart,
+    partition_views,
+)
+from gsmerge.blocks.start_block import BlockStart, start_block
+from gsmerge.counts.file_size import drop_to_bytes, measure_least_bytes
 from gsmerge.errors import Doubt
 from gsmerge.fit import fit_scene, peak_weights
 from gsmerge.geometry.frame import Frame, scene_frame
@@ -42,18 +54,6 @@ from gsmerge.scoring.evaluate import evaluate
 from gsmerge.settings.budget import AUTO, parse_share, share_text
 from gsmerge.settings.compact import ONE_PIECE, CompactOptions
 from gsmerge.settings.evaluate import EvaluateOptions
-from gsmerge.special.blocks.fit_seams import fit_seams
-from gsmerge.special.blocks.partition import (
-    Block,
-    Covisibility,
-    count_factors,
-    gaussians_at_once,
-    measure_covisibility,
-    partition_apart,
-    partition_views,
-)
-from gsmerge.special.blocks.start_block import BlockStart, start_block
-from gsmerge.special.file_size import drop_to_bytes, measure_least_bytes
 from gsmerge.stages.clean import faintest_dropped
 from gsmerge.stages.prune import split_unseen
 from gsmerge.types import Cameras, Decoded, Gaussians, Scene

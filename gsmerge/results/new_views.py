@@ -20,12 +20,12 @@ from gsmerge.pipeline import build
 from gsmerge.plan.plan import Plan
 from gsmerge.prepare.prepared import Prepared
 from gsmerge.raster.photos import shrink_pictures
+from gsmerge.results.left_out import LEAST_SEEN, choose_left_out, leave_out, mean_seen
 from gsmerge.results.report import CompactReport, NewViews, compared_psnr
 from gsmerge.runtime.record import begin_part, record_part
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.budget import parse_share
 from gsmerge.settings.stages import SHARE
-from gsmerge.special.left_out import LEAST_SEEN, choose_left_out, leave_out, mean_seen
 from gsmerge.types import PicturedScene, Pixels
 
 TRIAL_PIXELS = 120  # the longer side of the small pictures has at least this many pixels

@@ -11,6 +11,8 @@ from typing import Any, cast
 import pytest
 from messages import noted, refuses
 
+from gsmerge.counts.curve import CurvePoint, count_within, curve_counts, curve_knee
+from gsmerge.counts.search import MAX_BUILDS, MAX_LEFT_OUT_BUILDS, SAME_COUNT_RATIO, CountSearch, search_count
 from gsmerge.fit import FitOptions, Fitted
 from gsmerge.kernels import elementary
 from gsmerge.plan.counts import FIDELITY_LOSS, exact_count, level_counts, max_allowed
@@ -18,12 +20,10 @@ from gsmerge.plan.plan import CountPlan, Plan
 from gsmerge.prepare.prepared import Prepared
 from gsmerge.prepare.row_colors import PHOTOS
 from gsmerge.results.candidate import Candidate
+from gsmerge.results.left_out import LeftOut
 from gsmerge.runtime.record import Record
 from gsmerge.settings.budget import DEVICES, BudgetOptions, parse_share, share_text
 from gsmerge.settings.stages import CleanOptions
-from gsmerge.special.curve import CurvePoint, count_within, curve_counts, curve_knee
-from gsmerge.special.left_out import LeftOut
-from gsmerge.special.search import MAX_BUILDS, MAX_LEFT_OUT_BUILDS, SAME_COUNT_RATIO, CountSearch, search_count
 from gsmerge.types import Cameras, Gaussians
 
 
@@ -210,7 +210,7 @@ def test_search_begins_within_its_limits(default: int, first: int, monkeypatch: 
         gaussians = cast("Gaussians", range(count))
         return Candidate(count, cast("Fitted", None), gaussians, cast("Cameras", None), 30.0, Record(), 30.0)
 
-    monkeypatch.setattr("gsmerge.special.search.build_candidate", build)
+    monkeypatch.setattr("gsmerge.counts.search.build_candidate", build)
     plan = make_plan(target_psnr=25.0, least=700, most=900, default=default)
     reference = SimpleNamespace(name=PHOTOS, score_views=range(3))
     search_count(cast("Prepared", SimpleNamespace(reference=reference, agreement=None, can_leave_out=False)), plan)

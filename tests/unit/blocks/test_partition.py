@@ -9,8 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gsmerge import CompactOptions
-from gsmerge.plan.blocks import wanted_blocks
-from gsmerge.special.blocks.partition import (
+from gsmerge.blocks.partition import (
     SHARED,
     Block,
     Covisibility,
@@ -21,6 +20,7 @@ from gsmerge.special.blocks.partition import (
     partition_apart,
     partition_views,
 )
+from gsmerge.plan.blocks import wanted_blocks
 from gsmerge.types import Cameras, Scene
 
 

@@ -21,9 +21,9 @@ from gsmerge.plan.plan import Plan
 from gsmerge.prepare.prepared import Prepared
 from gsmerge.raster.metrics import WINDOW, ssim
 from gsmerge.raster.photos import Photos, render_photos, scene_photos
+from gsmerge.results.left_out import LEAST_SEEN, LeftOut
 from gsmerge.runtime.record import begin_part, record_part, report_progress
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.special.left_out import LEAST_SEEN, LeftOut
 from gsmerge.types import Gaussians
 
 PROGRESS = "curve: what each count brings"
