@@ -23,8 +23,9 @@ from captures import Records, export_capture, make_parser, make_table, require_l
 
 import gsmerge
 from gsmerge.geometry.views import even_views, midpoint_views, pick_views, subset
-from gsmerge.networks.checkpoint import IN_PACKAGE, load_checkpoint, save_checkpoint
+from gsmerge.networks.checkpoint import IN_PACKAGE
 from gsmerge.networks.options import SLOTS
+from gsmerge.reading.checkpoint import load_checkpoint, save_checkpoint
 from gsmerge.reading.held_out import HeldOutViews, read_held_out
 from gsmerge.reading.read_scene import read_files
 from gsmerge.reading.scene_files import find_scene_files

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from gsmerge.facts.pictures import RENDERS
+from gsmerge.facts.prepared import Prepared
 from gsmerge.fit import Fitted, fit_scene
 from gsmerge.geometry.pooling import Members
 from gsmerge.networks.corrector import ANALYTIC, Corrector
 from gsmerge.plan.plan import MergePlan, Plan
-from gsmerge.prepare.prepared import Prepared
-from gsmerge.prepare.row_colors import RENDERS
 from gsmerge.runtime.record import record_choices
 from gsmerge.stages.assign import assign
 from gsmerge.stages.decode import decode_merged

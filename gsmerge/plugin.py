@@ -15,10 +15,10 @@ from __future__ import annotations
 from gsmerge.errors import GsmergeError as GsmergeError
 from gsmerge.errors import SceneError as SceneError
 from gsmerge.errors import UsageError as UsageError
+from gsmerge.facts.prepared import Prepared as Prepared
 from gsmerge.plan.methods import Method as Method
 from gsmerge.plan.plan import Plan as Plan
 from gsmerge.prepare.prepare_scene import prepare as prepare
-from gsmerge.prepare.prepared import Prepared as Prepared
 from gsmerge.prepare.steps import without as without
 from gsmerge.runtime.record import note as note
 from gsmerge.runtime.record import stage as stage

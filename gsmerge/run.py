@@ -16,6 +16,9 @@ from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 from gsmerge.errors import Doubt, DoubtWarning, SceneError, TargetError
+from gsmerge.facts.pictures import RENDERS
+from gsmerge.facts.prepared import Prepared
+from gsmerge.facts.scene_size import measure_size
 from gsmerge.io import atomic_outputs
 from gsmerge.io.formats.rows import result_comments
 from gsmerge.io.formats.table import Contents
@@ -27,9 +30,6 @@ from gsmerge.plan.make_plan import is_without_views, make_plan, note_ignored
 from gsmerge.plan.plan import Plan
 from gsmerge.prepare.crop import crop_scene
 from gsmerge.prepare.prepare_scene import prepare
-from gsmerge.prepare.prepared import Prepared
-from gsmerge.prepare.row_colors import RENDERS
-from gsmerge.prepare.scene_size import measure_size
 from gsmerge.prepare.steps import STEPS, without
 from gsmerge.reading.exporters import NO_HINTS, ReadHints
 from gsmerge.reading.file_stats import doubt_changed

@@ -22,6 +22,8 @@ from gsmerge.blocks.partition import (
 from gsmerge.blocks.start_block import BlockStart, start_block
 from gsmerge.counts.file_size import drop_to_bytes, measure_least_bytes
 from gsmerge.errors import Doubt
+from gsmerge.facts.pictures import OWN_PHOTOS, PHOTOS
+from gsmerge.facts.scene_size import SceneSize
 from gsmerge.fit import fit_scene, peak_weights
 from gsmerge.geometry.frame import Frame, scene_frame
 from gsmerge.geometry.views import subset
@@ -30,8 +32,6 @@ from gsmerge.plan.counts import file_size
 from gsmerge.plan.forecast import INPUT_STEPS, STAGE_STEPS
 from gsmerge.plan.make_plan import plan_scene
 from gsmerge.plan.plan import Plan
-from gsmerge.prepare.row_colors import OWN_PHOTOS, PHOTOS
-from gsmerge.prepare.scene_size import SceneSize
 from gsmerge.raster.metrics import SAMPLE_LOSS, describe_loss, is_worse
 from gsmerge.raster.photos import blank_photos
 from gsmerge.results.report import CompactReport

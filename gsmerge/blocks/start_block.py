@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from gsmerge.blocks.partition import Block, Covisibility, owning_views
+from gsmerge.facts.prepared import Prepared
 from gsmerge.frozen import dataclass, replace
 from gsmerge.geometry.frame import Frame
 from gsmerge.pipeline import merge_views
 from gsmerge.plan.make_plan import make_plan
 from gsmerge.plan.plan import Plan
 from gsmerge.prepare.prepare_scene import prepare
-from gsmerge.prepare.prepared import Prepared
 from gsmerge.results.scores import measure_input
 from gsmerge.runtime.memory import free_pages, make_array
 from gsmerge.runtime.record import begin_part

@@ -69,10 +69,10 @@ def read_before_after(
     ``files`` are the files of the scene, which may be ``loaded`` already. If it has no views, some views are placed.
     """
     from gsmerge.io import read_gaussians
-    from gsmerge.prepare.place_cameras import NO_VIEWS, PLACED_VIEWS, add_views
     from gsmerge.reading.read_scene import read_files
     from gsmerge.reading.scene_files import result_cameras
     from gsmerge.runtime.record import record_run
+    from gsmerge.viewpoints.place_cameras import NO_VIEWS, PLACED_VIEWS, add_views
 
     if files.cameras is None and "cameras" not in files.named:  # a result may have cameras although its scene has none
         files = replace(files, cameras=next(filter(None, map(result_cameras, after)), None))

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 from gsmerge.counts.clean_up import build_candidate
 from gsmerge.errors import UsageError
+from gsmerge.facts.prepared import Prepared
 from gsmerge.io.formats.rows import MIP_COMMENT, RESULT_COMMENT
 from gsmerge.io.formats.table import Contents, Format
 from gsmerge.plan.plan import Plan
-from gsmerge.prepare.prepared import Prepared
 from gsmerge.results.candidate import Candidate, rescore
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.record import add_seconds

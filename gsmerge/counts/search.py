@@ -9,13 +9,13 @@ from typing import Any
 from gsmerge.counts.clean_up import build_candidate, clean_fitted, record_dropped
 from gsmerge.counts.curve import count_reaching, count_within, curve_counts, curve_knee, measure_curve
 from gsmerge.counts.file_size import meet_bytes
+from gsmerge.facts.pictures import PHOTOS, RENDERS
+from gsmerge.facts.prepared import LEAST_VIEWS, Prepared
 from gsmerge.kernels.elementary import exp, log, power
 from gsmerge.pipeline import build
 from gsmerge.plan.counts import FIDELITY_LOSS, level_counts
 from gsmerge.plan.forecast import STAGE_STEPS, run_parts
 from gsmerge.plan.plan import CountPlan, Plan
-from gsmerge.prepare.prepared import LEAST_VIEWS, Prepared
-from gsmerge.prepare.row_colors import PHOTOS, RENDERS
 from gsmerge.results.candidate import Candidate, score
 from gsmerge.results.left_out import LeftOut, choose_left_out, leave_out, mean_seen
 from gsmerge.results.scores import compares_all_pixels, may_leave_gaps, measure_input, measure_renders

@@ -39,7 +39,6 @@ from gsmerge.io.cameras.camera_file import sizes_of
 from gsmerge.io.cameras.read_cameras import read_sharp_camera
 from gsmerge.io.formats.read_gaussians import FileInfo
 from gsmerge.io.image_names import IMAGE_SUFFIXES
-from gsmerge.prepare.place_cameras import add_views
 from gsmerge.prepare.prepare_scene import scored_pictures
 from gsmerge.raster import render_in_batches
 from gsmerge.raster.photos import NEAR_PLANE
@@ -54,6 +53,7 @@ from gsmerge.scoring.sizes import fill_cameras, fill_photo, shrink_cameras
 from gsmerge.settings.files import CLIPS, GIF, PICTURES, TRANSPARENT
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.types import Cameras, Gaussians, StrPath
+from gsmerge.viewpoints.place_cameras import add_views
 
 SECONDS = 4  # least duration of a clip
 VIEW_FRAMES = 4  # least number of frames for each view of a spline

@@ -24,7 +24,6 @@ from gsmerge.io.formats.write import format_notes
 from gsmerge.io.photo_files import read_images
 from gsmerge.kernels.matrices import matmul
 from gsmerge.plan.counts import STREAMED_LEVELS, level_counts
-from gsmerge.prepare.place_cameras import place_viewpoints
 from gsmerge.reading.scene_files import find_scene_files, named_path, result_cameras, scene_title
 from gsmerge.results.outputs import NUM_FULL, Outputs, frame_notes, join_gaussians, pad_harmonics, write_outputs
 from gsmerge.runtime.documents import document_head, note_entries
@@ -37,6 +36,7 @@ from gsmerge.settings.stages import CleanOptions
 from gsmerge.stages.clean import clean, describe_counts
 from gsmerge.stages.pair_merge import merge_neighbors
 from gsmerge.types import NO_CAMERAS, Cameras, Gaussians, StrPath, make_scene
+from gsmerge.viewpoints.place_cameras import place_viewpoints
 
 
 @dataclass(frozen=True)

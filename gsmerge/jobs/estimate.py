@@ -11,6 +11,7 @@ import numpy as np
 from gsmerge.blocks.partition import gaussians_at_once
 from gsmerge.counts.curve import curve_counts
 from gsmerge.errors import count_words
+from gsmerge.facts.scene_size import measure_size
 from gsmerge.frozen import dataclass
 from gsmerge.geometry.frame import canonicalise
 from gsmerge.io.formats.ply import file_bytes
@@ -25,7 +26,6 @@ from gsmerge.prepare.confirm_depths import confirm_depths
 from gsmerge.prepare.crop import crop_scene
 from gsmerge.prepare.prepare_scene import views_notes
 from gsmerge.prepare.repeats import without_repeats
-from gsmerge.prepare.scene_size import measure_size
 from gsmerge.reading.read_scene import Loaded
 from gsmerge.results.outputs import Outputs
 from gsmerge.run import compact_scene

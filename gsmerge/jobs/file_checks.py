@@ -16,7 +16,7 @@ from gsmerge.io.formats.read_gaussians import degree_notes
 from gsmerge.io.formats.table import READ_ENDINGS, SCENE_SUFFIXES, STATE, STATE_ENDING, may_hold_gaussians
 from gsmerge.io.image_names import IMAGE_SUFFIXES, OTHER_SUFFIXES
 from gsmerge.jobs.states.state_file import holds_features, load_state
-from gsmerge.networks.checkpoint import load_checkpoint
+from gsmerge.reading.checkpoint import load_checkpoint
 from gsmerge.reading.exporters import NO_HINTS
 from gsmerge.reading.read_scene import read_files
 from gsmerge.reading.scene_files import find_scene_files

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from gsmerge.errors import Doubt, SceneError, attempt
+from gsmerge.facts.scene_size import unlike_captures
 from gsmerge.io import GaussianFile, file_notes, kept_comments
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.formats.gsm import list_batches
@@ -21,9 +22,7 @@ from gsmerge.plan.counts import describe_share
 from gsmerge.prepare.confirm_depths import confirm_depths
 from gsmerge.prepare.prepare_scene import views_notes
 from gsmerge.prepare.repeats import without_repeats
-from gsmerge.prepare.scene_size import unlike_captures
 from gsmerge.prepare.steps import begin, select, take_steps
-from gsmerge.prepare.support import count_views_in_world
 from gsmerge.raster.photos import LEAST_OPACITY
 from gsmerge.reading.alignment import check_cameras
 from gsmerge.reading.candidates import read_scene_cameras
@@ -42,6 +41,7 @@ from gsmerge.settings.reading import OpacityChoice
 from gsmerge.settings.setting import join_words
 from gsmerge.stages.sky import sky_regions
 from gsmerge.types import StrPath
+from gsmerge.viewpoints.support import count_views_in_world
 
 _OWN = "gsmerge"  # exporter of files that gsmerge wrote
 _FILE_KEYS = (

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from gsmerge.errors import UsageError
+from gsmerge.facts.agreement import FEWEST, Agreement
+from gsmerge.facts.scene_size import SceneSize
 from gsmerge.frozen import dataclass, replace
 from gsmerge.io.formats.table import PLY, Format, count_for_bytes, output_format
-from gsmerge.prepare.confirm_depths import FEWEST, Agreement
-from gsmerge.prepare.scene_size import SceneSize
 from gsmerge.runtime.record import note
 from gsmerge.settings.budget import AUTO, DEVICES, BudgetOptions, parse_budget, parse_bytes
 from gsmerge.settings.compact import OURS, CompactOptions

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 
+from gsmerge.facts.prepared import Prepared
+from gsmerge.facts.scene_size import SceneSize
 from gsmerge.fit import photo_scale
 from gsmerge.frozen import replace
 from gsmerge.plan.efforts import EFFORTS
-from gsmerge.prepare.prepared import Prepared
-from gsmerge.prepare.scene_size import SceneSize
 from gsmerge.runtime.record import note
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.fit import GROW_ROUNDS, GROW_STEPS, USUAL_SHARE, FitOptions

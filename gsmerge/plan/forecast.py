@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from gsmerge.facts.pictures import RENDERS
+from gsmerge.facts.prepared import Prepared
 from gsmerge.plan.plan import Plan
-from gsmerge.prepare.prepared import Prepared
-from gsmerge.prepare.row_colors import RENDERS
 from gsmerge.runtime.record import RunPart
 
 # Number of candidates that a search usually builds: first, if photos score them; second, if renders of the input do

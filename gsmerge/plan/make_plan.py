@@ -10,6 +10,9 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from gsmerge.errors import UsageError
+from gsmerge.facts.pictures import RENDERS
+from gsmerge.facts.prepared import Prepared
+from gsmerge.facts.scene_size import SceneSize
 from gsmerge.fit import start_share
 from gsmerge.frozen import replace
 from gsmerge.geometry.views import pick_views, scored_views
@@ -26,9 +29,6 @@ from gsmerge.plan.efforts import EFFORTS
 from gsmerge.plan.fit import SHORT_STEPS, fit_to_pictures, resolve_fit
 from gsmerge.plan.networks import choose_networks, cuts_views, load_networks
 from gsmerge.plan.plan import CountPlan, MergePlan, Plan, ScorePlan
-from gsmerge.prepare.prepared import Prepared
-from gsmerge.prepare.row_colors import RENDERS
-from gsmerge.prepare.scene_size import SceneSize
 from gsmerge.raster.photos import scored_tiles
 from gsmerge.runtime.record import note, stage
 from gsmerge.settings.budget import AUTO

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from gsmerge.errors import UsageError
+from gsmerge.facts.scene_size import SceneSize
 from gsmerge.frozen import replace
 from gsmerge.plan.efforts import EFFORTS
-from gsmerge.prepare.scene_size import SceneSize
 from gsmerge.runtime.record import note
 from gsmerge.settings.compact import CHECKPOINTS, OURS, CompactOptions
 
@@ -39,14 +39,14 @@ def load_networks(options: CompactOptions, size: SceneSize) -> Checkpoint | None
     """
     if not cuts_views(options, size):
         if options.checkpoint not in CHECKPOINTS:  # refuse a damaged file, although nothing would use it
-            from gsmerge.networks.checkpoint import load_checkpoint
+            from gsmerge.reading.checkpoint import load_checkpoint
 
             load_checkpoint(options.checkpoint)
         return None
     name = choose_networks(options, size)
     if name == "none":  # as in most runs, which then need not import the modules of networks
         return None
-    from gsmerge.networks.checkpoint import find_checkpoint
+    from gsmerge.reading.checkpoint import find_checkpoint
 
     checkpoint, notes = find_checkpoint(name, required=options.require_checkpoint)
     for text in notes:

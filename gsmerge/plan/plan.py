@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from gsmerge.facts.prepared import Prepared
 from gsmerge.frozen import dataclass, replace
 from gsmerge.plan.counts import FileSize
-from gsmerge.prepare.prepared import Prepared
 from gsmerge.settings.fit import FitOptions
 from gsmerge.settings.stages import CleanOptions, DecodeOptions, MatchOptions
 from gsmerge.stages.limits import CountLimits

@@ -32,11 +32,12 @@ from gsmerge.compare.colors import (
 from gsmerge.compare.similarity import stands_out
 from gsmerge.compare.view_pictures import PICTURE_PIXELS, Pairs, ViewPictures, draw_canonical, pair_photos, show_views
 from gsmerge.errors import Doubt
+from gsmerge.geometry.gaps import fill_gaps
 from gsmerge.geometry.transforms import sh0_to_rgb
 from gsmerge.geometry.views import camera_kinds
 from gsmerge.kernels.pictures import convolve
 from gsmerge.prepare.photo_change import PhotoChange, change_large
-from gsmerge.prepare.row_colors import RowPicture, fill_gaps, picture_rows
+from gsmerge.prepare.row_colors import RowPicture, picture_rows
 from gsmerge.raster import render
 from gsmerge.raster.photos import counting_pixels, row_pictures
 from gsmerge.runtime.record import list_some, note, record_choices

@@ -8,32 +8,16 @@ import numpy as np
 
 from gsmerge.errors import UsageError
 from gsmerge.geometry.frame import canonicalise
-from gsmerge.geometry.transforms import euler_to_rotmat, lies_inside, rgb_to_sh0
+from gsmerge.geometry.regions import find_region
+from gsmerge.geometry.transforms import lies_inside, rgb_to_sh0
 from gsmerge.geometry.views import take_rows
 from gsmerge.prepare.fill_holes import usual_opacity
 from gsmerge.raster import render_in_batches
 from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import use_threads
-from gsmerge.settings.stages import parse_crop
-from gsmerge.types import Region, Scene
+from gsmerge.types import Scene
 
 MOSTLY = 0.5  # a pixel mostly shows the inside if more than this share of its opacity is from Gaussians inside
-
-
-def find_region(crop: str) -> Region:
-    """Return the region that the text of a crop describes, in world units."""
-    shape, parsed = parse_crop(crop)
-    numbers = np.array(parsed)
-    if shape == "sphere":
-        return Region(numbers[:3], np.full(3, numbers[3]), np.eye(3), is_sphere=True)
-    low, high, degrees = numbers[:3], numbers[3:6], np.pad(numbers[6:], (0, 9 - len(numbers)))
-    rotation = euler_to_rotmat(degrees).T if degrees.any() else np.eye(3)
-    return Region((low + high) / 2, (high - low) / 2, rotation, is_sphere=False)
-
-
-def inside_crop(means: np.ndarray, crop: str) -> np.ndarray:
-    """Return a mask ``[n]`` of the world-frame centres ``[n,3]`` inside a crop, border included."""
-    return lies_inside(find_region(crop), means)
 
 
 def crop_scene(scene: Scene, crop: str) -> Scene:

@@ -12,12 +12,13 @@ import cv2
 import numpy as np
 
 from gsmerge.frozen import dataclass, replace
-from gsmerge.geometry.transforms import camera_depths, lies_inside, nearest_views, rgb_to_sh0
-from gsmerge.kernels.matrices import invert, matmul
+from gsmerge.geometry.gaps import fill_gaps
+from gsmerge.geometry.pixel_gaussians import NEW_SIZE_PIXELS, make_round_gaussians, pixel_rays
+from gsmerge.geometry.transforms import camera_depths, lies_inside, nearest_views
+from gsmerge.kernels.matrices import matmul
 from gsmerge.kernels.pictures import blur
 from gsmerge.kernels.reproject import add_differences
 from gsmerge.prepare.photo_change import PhotoChange, change_large
-from gsmerge.prepare.row_colors import fill_gaps
 from gsmerge.raster import TiledView
 from gsmerge.raster.composite import blend_depths
 from gsmerge.raster.images import tile_views
@@ -42,7 +43,6 @@ FACTORS = 2.0 ** np.linspace(0, 3, 13)  # candidate depths, relative to the dept
 FARTHEST_QUANTILE = 0.99  # quantile of the depths that counts as the farthest
 HOLE_NEIGHBORS = 3  # number of nearest views that a picture is compared with
 DIFFERENCE_BLUR = 3.0  # standard deviation in pixels of the window over which differences are averaged
-NEW_SIZE_PIXELS, NEW_OPACITY = 0.75, 0.9  # standard deviation in pixels, and opacity, of a new Gaussian
 BARE = 0.02  # opacity up to which the Gaussian of a pixel shows nothing
 
 
@@ -235,27 +235,3 @@ def _fill_view(scene: PicturedScene, view: int, holes: np.ndarray, edges: _Edges
         best_depths = np.where(np.isfinite(edges.known), np.minimum(edges.known, farthest), best_depths)
     size = NEW_SIZE_PIXELS / cameras.Ks[view, 0, 0]
     return make_round_gaussians(eye, rays, best_depths, size, colors, scene.gaussians.shN.shape[1])
-
-
-def pixel_rays(mask: np.ndarray, K: np.ndarray, viewmat: np.ndarray) -> np.ndarray:
-    """Return the vectors ``[n,3]``, in the world, from a camera to depth 1 on the rays of the pixels of ``mask``."""
-    y, x = np.nonzero(mask)
-    pixels = np.stack([x + 0.5, y + 0.5, np.ones(len(x))], 1)
-    return matmul(matmul(pixels, invert(K).T), viewmat[:3, :3])
-
-
-def make_round_gaussians(
-    eye: np.ndarray, rays: np.ndarray, depths: np.ndarray, size: float, colors: np.ndarray, num_higher: int
-) -> Gaussians:
-    """Make round Gaussians at ``depths [n]`` along ``rays [n,3]`` from ``eye``, with ``colors [n,3]`` (sRGB).
-
-    ``size`` is the standard deviation of a Gaussian at depth 1, ``num_higher`` the number of harmonics above degree 0.
-    """
-    return Gaussians(
-        means=(eye + depths[:, None] * rays).astype(np.float32),
-        quats=np.tile(np.array([1, 0, 0, 0], np.float32), (len(rays), 1)),
-        scales=np.repeat((size * depths)[:, None], 3, 1).astype(np.float32),
-        opacities=np.full(len(rays), NEW_OPACITY, np.float32),
-        sh0=rgb_to_sh0(colors)[:, None].astype(np.float32),
-        shN=np.zeros((len(rays), num_higher, 3), np.float32),
-    )

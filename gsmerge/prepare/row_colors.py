@@ -11,10 +11,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TypeVar
 
-import cv2
 import numpy as np
 
+from gsmerge.facts.pictures import ROW_COLORS
 from gsmerge.frozen import dataclass
+from gsmerge.geometry.gaps import fill_gaps
 from gsmerge.geometry.transforms import camera_depths, sh0_to_rgb
 from gsmerge.geometry.views import camera_kinds, subset
 from gsmerge.kernels.pictures import blur
@@ -25,12 +26,6 @@ from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import in_turn
 from gsmerge.types import PicturedScene, Scene
 
-# Names, in messages, of the pictures to which results are fitted and with which they are compared. Without photos,
-# these pictures are the colours of the rows, or renders if the rows belong to no pixels
-OWN_PHOTOS = "the scene's own photos"
-PHOTOS = "photos"
-ROW_COLORS = "the model's own pixels"
-RENDERS = "renders of the input"
 NO_PHOTOS = f"no photos: {ROW_COLORS} are used instead; name photos with --images"
 FAINT_OPACITY = 0.1  # opacity of a pixel's Gaussians below which their colours mean little
 # Standard deviation in pixels. After this blur, colours from photos differ from drawings by at most .18 of [0, 1] in
@@ -127,15 +122,3 @@ def _blend_layers(layers: Scene, colors: np.ndarray) -> tuple[np.ndarray, np.nda
         transmittance -= weight
     opacity = 1 - transmittance
     return total / np.maximum(opacity, np.float32(1e-6))[..., None], opacity
-
-
-def fill_gaps(picture: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """Fill the pixels of a picture ``[h,w,c]`` outside ``valid [h,w]`` with the values of the nearest pixel inside."""
-    if valid.all() or not valid.any():
-        return picture
-    _, labels = cv2.distanceTransformWithLabels(
-        (~valid).astype(np.uint8), cv2.DIST_L1, 3, labelType=cv2.DIST_LABEL_PIXEL
-    )
-    nearest = np.zeros(int(labels.max()) + 1, np.int64)
-    nearest[labels[valid]] = np.flatnonzero(valid)
-    return np.asarray(picture.reshape(valid.size, -1)[nearest[labels]])

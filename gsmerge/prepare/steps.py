@@ -12,6 +12,8 @@ from typing import cast
 import numpy as np
 
 from gsmerge.errors import count_words
+from gsmerge.facts.pictures import PHOTOS, RENDERS, ROW_COLORS
+from gsmerge.facts.prepared import Prepared, Reference, with_photos
 from gsmerge.frozen import dataclass, replace
 from gsmerge.geometry.frame import Frame, canonicalise
 from gsmerge.prepare.compare_photos import compare_photos
@@ -21,15 +23,14 @@ from gsmerge.prepare.draw_outside import draw_outside
 from gsmerge.prepare.exposure import equalise_exposure
 from gsmerge.prepare.fill_holes import fill_holes
 from gsmerge.prepare.move_poses import move_poses
-from gsmerge.prepare.place_cameras import HELD_OUT, draw_pictures, keep_finite, place_views
-from gsmerge.prepare.prepared import Prepared, Reference, with_photos
 from gsmerge.prepare.repeats import without_repeats
-from gsmerge.prepare.row_colors import PHOTOS, RENDERS, ROW_COLORS, add_row_colors
+from gsmerge.prepare.row_colors import add_row_colors
 from gsmerge.prepare.true_pixels import raise_sizes, with_pixels
 from gsmerge.raster.photos import counting_pixels
 from gsmerge.runtime.record import note, record_choices
 from gsmerge.settings.stages import PrepareOptions
 from gsmerge.types import PicturedScene, Scene
+from gsmerge.viewpoints.place_cameras import HELD_OUT, draw_pictures, keep_finite, place_views
 
 WORLD = Frame(np.zeros(3), 1.0)  # the frame of a scene as it was read
 

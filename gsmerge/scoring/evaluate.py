@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from gsmerge.arrays import ArrayFields, as_pictures
 from gsmerge.errors import Doubt, UsageError, list_doubts
+from gsmerge.facts.pictures import OWN_PHOTOS, PHOTOS, RENDERS, ROW_COLORS
 from gsmerge.frozen import dataclass, field, fields, replace
 from gsmerge.geometry.frame import scene_frame
 from gsmerge.geometry.views import pick_views
 from gsmerge.prepare.prepare_scene import scored_pictures
-from gsmerge.prepare.row_colors import OWN_PHOTOS, PHOTOS, RENDERS, ROW_COLORS
 from gsmerge.raster import render
 from gsmerge.raster.metrics import describe_loss, psnr_within, ssim_within
 from gsmerge.raster.photos import COVERED_TRANSMITTANCE, NEAR_PLANE, WHOLE_SHARE

@@ -6,14 +6,14 @@ from collections.abc import Callable
 
 import numpy as np
 
+from gsmerge.geometry.regions import inside_crop
 from gsmerge.geometry.transforms import find_nearest
-from gsmerge.prepare.crop import inside_crop
-from gsmerge.prepare.place_cameras import place_viewpoints
-from gsmerge.prepare.support import count_views
 from gsmerge.raster.photos import LEAST_OPACITY
 from gsmerge.settings.stages import CleanOptions
 from gsmerge.stages.sky import sky
 from gsmerge.types import Cameras, Gaussians
+from gsmerge.viewpoints.place_cameras import place_viewpoints
+from gsmerge.viewpoints.support import count_views
 
 BOX_QUANTILES = (1, 99)  # the scene's box reaches from the first to the second percentile of positions on each axis
 FLOATER_NEIGHBORS = 8  # an isolated Gaussian touches none of its FLOATER_NEIGHBORS nearest Gaussians

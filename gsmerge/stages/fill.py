@@ -14,18 +14,18 @@ import numpy as np
 
 from gsmerge.fit.outside import Outside
 from gsmerge.frozen import dataclass, replace
+from gsmerge.geometry.gaps import fill_gaps
+from gsmerge.geometry.pixel_gaussians import NEW_SIZE_PIXELS, make_round_gaussians, pixel_rays
 from gsmerge.geometry.transforms import is_inside, project
 from gsmerge.geometry.views import resize_cameras
 from gsmerge.kernels.pictures import blur
-from gsmerge.prepare.fill_holes import NEW_SIZE_PIXELS, make_round_gaussians, pixel_rays
-from gsmerge.prepare.place_cameras import between_cameras
-from gsmerge.prepare.row_colors import fill_gaps
 from gsmerge.raster import Splats, make_splats
 from gsmerge.raster.composite import blend, blend_depths, view_colors
 from gsmerge.raster.images import tile_camera
 from gsmerge.runtime.record import stage
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians
+from gsmerge.viewpoints.place_cameras import between_cameras
 
 # Chosen on seven training captures
 FILLED_SHARE = 0.03  # largest number of new Gaussians, as a share of the fitted ones

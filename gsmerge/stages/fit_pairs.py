@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from gsmerge.facts.prepared import Prepared
 from gsmerge.fit import Fitted, fit_scene
-from gsmerge.prepare.prepared import Prepared
 from gsmerge.raster.photos import scene_photos, score_photos
 from gsmerge.runtime.record import record_part
 from gsmerge.settings.fit import FitOptions

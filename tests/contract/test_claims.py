@@ -22,27 +22,29 @@ from gsmerge.blocks import partition
 from gsmerge.counts import curve
 from gsmerge.drawing import render_files as drawings
 from gsmerge.drawing.pages import data, splats
+from gsmerge.facts import agreement, scene_size
+from gsmerge.facts.prepared import LEAST_VIEWS
 from gsmerge.fit import outside, photo_sizes, schedule, stage
 from gsmerge.fit import report as fit_report
 from gsmerge.geometry import views
 from gsmerge.io import bounds, photo_files
 from gsmerge.io.formats import ply
 from gsmerge.kernels.raster import blend
-from gsmerge.networks.checkpoint import IN_PACKAGE, load_checkpoint
+from gsmerge.networks.checkpoint import IN_PACKAGE
 from gsmerge.networks.options import RESIDUAL, SLOTS
 from gsmerge.plan import counts
 from gsmerge.plan import fit as fit_plan
 from gsmerge.plan.blocks import BLOCK_GAUSSIANS, BLOCK_VIEWS, WHOLE_GAUSSIANS, WHOLE_VIEWS
 from gsmerge.plan.efforts import EFFORTS
 from gsmerge.plan.make_plan import LONE_K
-from gsmerge.prepare import confirm_depths, exposure, scene_size
+from gsmerge.prepare import exposure
 from gsmerge.prepare import fill_holes as holes
-from gsmerge.prepare.prepared import LEAST_VIEWS
 from gsmerge.raster import metrics, photos, tiled_view
 from gsmerge.reading.alignment import align_rows as rows_first
 from gsmerge.reading.alignment import score
 from gsmerge.reading.alignment import score as cameras_off
 from gsmerge.reading.alignment.registration import register
+from gsmerge.reading.checkpoint import load_checkpoint
 from gsmerge.reading.held_out import read_held_out
 from gsmerge.reading.read_scene import load_scene
 from gsmerge.results import new_views, scores
@@ -134,9 +136,9 @@ CLAIMS: dict[str, tuple[str, ...]] = {
         f"at most what the device draws fluidly: {', '.join(f'{count:,}' for count in DEVICES.values())}",
         f"| `--k` | 1 to {MAX_CHILDREN} | this number for each superpixel; 1 by default, {LONE_K} for a single",
         f"measures quality as PSNR plus {curve.SSIM_DB:g} dB times SSIM",
-        f"The useful number of Gaussians is {percent(confirm_depths.MOST_PER_PIXEL)} of the input if other views"
-        f" confirm at least {percent(confirm_depths.SOUND_SHARE)} of the depth, and {percent(confirm_depths.FEWEST)} if"
-        f" they confirm {percent(confirm_depths.WRONG_SHARE)} or less",
+        f"The useful number of Gaussians is {percent(agreement.MOST_PER_PIXEL)} of the input if other views"
+        f" confirm at least {percent(agreement.SOUND_SHARE)} of the depth, and {percent(agreement.FEWEST)} if"
+        f" they confirm {percent(agreement.WRONG_SHARE)} or less",
         f"With {word(LEAST_VIEWS)} photos or more, both kinds of `--quality` leave out some views",
         f"The estimate of the gain needs at least {word(LEAST_VIEWS)} photos, a result with at most"
         f" {percent(new_views.MOST_SHARE)} as many Gaussians as pixels",

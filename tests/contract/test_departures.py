@@ -13,9 +13,10 @@ from network_fixtures import made, noisy, untrained
 
 from gsmerge.arrays import as_array
 from gsmerge.networks.apply import encode_features
-from gsmerge.networks.checkpoint import IN_PACKAGE, load_checkpoint
+from gsmerge.networks.checkpoint import IN_PACKAGE
 from gsmerge.networks.corrections import residual_limits
 from gsmerge.networks.options import ABSOLUTE_BOUNDS, GROUP_COLUMNS, NetworkOptions, weight_shapes
+from gsmerge.reading.checkpoint import load_checkpoint
 from gsmerge.settings.compact import RECIPES
 from gsmerge.settings.stages import DecodeOptions, SegmentOptions
 from gsmerge.stages.decode import decode

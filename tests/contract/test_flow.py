@@ -10,7 +10,7 @@ from dataclasses import fields
 from pathlib import Path
 
 import gsmerge
-from gsmerge.prepare.prepared import Prepared
+from gsmerge.facts.prepared import Prepared
 from gsmerge.settings.stages import PrepareOptions
 
 PACKAGE = Path(gsmerge.__file__).parent

@@ -46,7 +46,7 @@ from gsmerge.io.photo_files import decode_alpha, decode_levels
 from gsmerge.jobs.states.compactor import Compactor
 from gsmerge.jobs.states.state_file import load_state
 from gsmerge.kernels.matrices import invert
-from gsmerge.networks.checkpoint import load_checkpoint
+from gsmerge.reading.checkpoint import load_checkpoint
 from gsmerge.reading.read_scene import load_scene
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.types import Gaussians

@@ -16,7 +16,7 @@ from training_runs import whole_photo
 
 pytest.importorskip("torch", reason="torch is not installed")
 
-from gsmerge.networks.checkpoint import load_checkpoint
+from gsmerge.reading.checkpoint import load_checkpoint
 from gsmerge.research.commands.train_command import find_training_scenes
 from gsmerge.research.training import Example, TrainOptions
 from gsmerge.research.training.examples import make_examples

@@ -13,7 +13,8 @@ from shared import write_smallest
 from sweeps import sweep
 
 import gsmerge
-from gsmerge.prepare.row_colors import NO_PHOTOS, ROW_COLORS
+from gsmerge.facts.pictures import ROW_COLORS
+from gsmerge.prepare.row_colors import NO_PHOTOS
 
 from .conftest import Run
 

@@ -10,9 +10,9 @@ from scenes import arc, make_scene, room
 
 from gsmerge.geometry.pooling import Members, scene_members
 from gsmerge.networks.apply import NetworkContext
-from gsmerge.networks.checkpoint import save_checkpoint
 from gsmerge.networks.options import NetworkOptions, weight_shapes
 from gsmerge.networks.weights import NetworkWeights
+from gsmerge.reading.checkpoint import save_checkpoint
 from gsmerge.stages.encode import encode
 from gsmerge.types import FeatureGaussians, Groups, Scene
 

@@ -14,9 +14,9 @@ from sweeps import sweep
 
 from gsmerge import CompactResult, Gaussians, Scene, compact
 from gsmerge.compare.view_pictures import show_views
+from gsmerge.facts.pictures import ROW_COLORS
 from gsmerge.geometry.frame import canonicalise
 from gsmerge.prepare.compare_photos import compare_photos, find_matching_views
-from gsmerge.prepare.row_colors import ROW_COLORS
 from gsmerge.types import PicturedScene
 
 Photos = np.ndarray

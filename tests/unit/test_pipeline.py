@@ -8,8 +8,8 @@ import pytest
 import scenes
 
 from gsmerge import Scene, compact
+from gsmerge.facts.pictures import PHOTOS, ROW_COLORS
 from gsmerge.kernels import elementary
-from gsmerge.prepare.row_colors import PHOTOS, ROW_COLORS
 from gsmerge.raster.photos import scene_photos, scene_pictures, score_photos
 from gsmerge.runtime.record import STAGES
 from gsmerge.settings.stages import SEGMENTATIONS

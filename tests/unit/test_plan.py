@@ -16,6 +16,8 @@ from scenes import psnr_of
 from gsmerge import CompactOptions, Scene, compact
 from gsmerge.counts.search import MAX_BUILDS, add_target
 from gsmerge.errors import UsageError
+from gsmerge.facts.agreement import Agreement
+from gsmerge.facts.scene_size import SceneSize, measure_size
 from gsmerge.fit import Fitted
 from gsmerge.geometry.frame import canonicalise
 from gsmerge.geometry.views import REPORT_VIEWS
@@ -28,9 +30,8 @@ from gsmerge.plan.forecast import LEVEL_SHARE, run_parts
 from gsmerge.plan.make_plan import is_without_views, make_plan, plan_scene
 from gsmerge.plan.networks import choose_networks
 from gsmerge.plan.plan import Plan
-from gsmerge.prepare.confirm_depths import Agreement, confirm_depths
+from gsmerge.prepare.confirm_depths import confirm_depths
 from gsmerge.prepare.prepare_scene import prepare
-from gsmerge.prepare.scene_size import SceneSize, measure_size
 from gsmerge.results.candidate import score
 from gsmerge.runtime.record import record_run
 from gsmerge.settings.compact import EFFORT_NAMES as NAMES

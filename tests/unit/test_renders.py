@@ -11,6 +11,7 @@ import scenes
 import unaligned_scenes
 
 from gsmerge import Cameras, CompactOptions, Scene, compact, render
+from gsmerge.facts.scene_size import measure_size
 from gsmerge.fit import Fitted
 from gsmerge.fit.outside import STEP_BACK_HIGH, STEP_BACK_LOW, outside_cameras
 from gsmerge.fit.report import FitReport
@@ -18,7 +19,10 @@ from gsmerge.geometry.transforms import camera_centres
 from gsmerge.jobs.estimate import estimate
 from gsmerge.pipeline import build
 from gsmerge.plan.make_plan import make_plan, plan_scene
-from gsmerge.prepare.place_cameras import (
+from gsmerge.prepare.prepare_scene import prepare
+from gsmerge.raster.metrics import psnr
+from gsmerge.types import Decoded, Gaussians, Region
+from gsmerge.viewpoints.place_cameras import (
     FEW_RENDERED_VIEWS,
     MOST_OUTSIDE,
     OUTSIDE_SHARE,
@@ -26,10 +30,6 @@ from gsmerge.prepare.place_cameras import (
     draw_around,
     draw_pictures,
 )
-from gsmerge.prepare.prepare_scene import prepare
-from gsmerge.prepare.scene_size import measure_size
-from gsmerge.raster.metrics import psnr
-from gsmerge.types import Decoded, Gaussians, Region
 
 
 @pytest.fixture(scope="module")

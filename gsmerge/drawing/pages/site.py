@@ -16,9 +16,9 @@ from gsmerge.io.atomic import AddOutput
 from gsmerge.io.formats.rows import read_expected_scores
 from gsmerge.io.formats.sog import sog_bytes
 from gsmerge.io.formats.table import Contents
-from gsmerge.prepare.place_cameras import place_viewpoints
 from gsmerge.raster import render
 from gsmerge.types import Cameras, Gaussians
+from gsmerge.viewpoints.place_cameras import place_viewpoints
 
 # Content security policy: only the page's own scripts run. The script of the 3D viewer Spark starts a worker, and loads
 # data: addresses that it holds itself

@@ -15,7 +15,7 @@ from gsmerge.io.formats.table import estimate_counts
 from gsmerge.io.formats.write import level_output
 from gsmerge.jobs.batch.find import count_links, find_named_scenes, main_file, scene_plys
 from gsmerge.jobs.content_hash import content_hash, digest, fill_template, list_files, scene_name
-from gsmerge.networks.checkpoint import load_checkpoint
+from gsmerge.reading.checkpoint import load_checkpoint
 from gsmerge.reading.scene_files import SceneFiles, find_scene_files
 from gsmerge.results.outputs import Outputs
 from gsmerge.run import compact_files

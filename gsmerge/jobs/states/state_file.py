@@ -25,8 +25,8 @@ from gsmerge.io.formats.gsm import (
     write_scene,
 )
 from gsmerge.jobs.states.features import FeatureState, ViewSamples
-from gsmerge.networks.checkpoint import build_networks
 from gsmerge.networks.options import CORRECTED, GROUP_COLUMNS
+from gsmerge.reading.checkpoint import build_networks
 from gsmerge.reading.read_scene import load_scene
 from gsmerge.types import FeatureGaussians, Gaussians, Scene, StrPath
 

@@ -24,8 +24,9 @@ from gsmerge.kernels.networks.layers import (
     padded,
     scratch_size,
 )
-from gsmerge.networks.checkpoint import IN_PACKAGE, load_checkpoint
+from gsmerge.networks.checkpoint import IN_PACKAGE
 from gsmerge.networks.options import GROUP_COLUMNS, MEMBER_COLUMNS, PART_COLUMNS, SLOTS, NetworkOptions, weight_shapes
+from gsmerge.reading.checkpoint import load_checkpoint
 from gsmerge.runtime.threads import parallel_map, use_threads
 
 SHAPES = [(0, 3, 2), (1, 1, 1), (1, 5, 3), (5, 16, 16), (7, 48, 48), (13, 19, 50), (6, 0, 4)]

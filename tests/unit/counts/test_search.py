@@ -13,12 +13,12 @@ from messages import noted, refuses
 
 from gsmerge.counts.curve import CurvePoint, count_within, curve_counts, curve_knee
 from gsmerge.counts.search import MAX_BUILDS, MAX_LEFT_OUT_BUILDS, SAME_COUNT_RATIO, CountSearch, search_count
+from gsmerge.facts.pictures import PHOTOS
+from gsmerge.facts.prepared import Prepared
 from gsmerge.fit import FitOptions, Fitted
 from gsmerge.kernels import elementary
 from gsmerge.plan.counts import FIDELITY_LOSS, exact_count, level_counts, max_allowed
 from gsmerge.plan.plan import CountPlan, Plan
-from gsmerge.prepare.prepared import Prepared
-from gsmerge.prepare.row_colors import PHOTOS
 from gsmerge.results.candidate import Candidate
 from gsmerge.results.left_out import LeftOut
 from gsmerge.runtime.record import Record

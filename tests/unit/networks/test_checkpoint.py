@@ -10,7 +10,8 @@ import numpy as np
 from network_fixtures import SMALL, noisy, written
 
 import gsmerge
-from gsmerge.networks.checkpoint import SHIPPED, find_checkpoint, load_checkpoint
+from gsmerge.networks.checkpoint import SHIPPED
+from gsmerge.reading.checkpoint import find_checkpoint, load_checkpoint
 
 
 def test_written_checkpoint_is_read_back(tmp_path: Path) -> None:

@@ -27,11 +27,11 @@ from gsmerge.compare.colors import (
     vary_in_hue,
 )
 from gsmerge.compare.view_pictures import Pairs, ViewPictures
+from gsmerge.facts.pictures import PHOTOS, ROW_COLORS
 from gsmerge.geometry.transforms import rgb_to_sh0, sh0_to_rgb
 from gsmerge.prepare.compare_photos import are_exchanged, compare_photos, find_grey, have_other_tones
 from gsmerge.prepare.photo_change import LUMA, PhotoChange
 from gsmerge.prepare.prepare_scene import prepare
-from gsmerge.prepare.row_colors import PHOTOS, ROW_COLORS
 from gsmerge.runtime.record import record_run
 from gsmerge.types import PicturedScene
 

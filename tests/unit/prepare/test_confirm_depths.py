@@ -13,18 +13,11 @@ from motions import with_nearer_half
 
 import gsmerge
 from gsmerge import Cameras, Scene
+from gsmerge.facts.agreement import FEWEST, MOST_PER_PIXEL, Agreement
 from gsmerge.geometry.pooling import scene_members
 from gsmerge.kernels.elementary import log
 from gsmerge.plan.make_plan import make_plan
-from gsmerge.prepare.confirm_depths import (
-    AGREEMENT_PIXELS,
-    AGREEMENT_SHARE,
-    FEWEST,
-    MOST_PER_PIXEL,
-    SAME_LOG_DEPTH,
-    Agreement,
-    confirm_depths,
-)
+from gsmerge.prepare.confirm_depths import AGREEMENT_PIXELS, AGREEMENT_SHARE, SAME_LOG_DEPTH, confirm_depths
 from gsmerge.prepare.prepare_scene import prepare
 from gsmerge.runtime.record import record_run
 from gsmerge.settings.compact import CompactOptions

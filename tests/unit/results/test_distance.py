@@ -15,10 +15,9 @@ from messages import refuses
 import gsmerge
 from gsmerge import Gaussians, Scene, compact, pipeline, render
 from gsmerge.errors import TargetError
+from gsmerge.facts.prepared import Prepared
 from gsmerge.geometry.views import resize_cameras
-from gsmerge.prepare.place_cameras import between_cameras
 from gsmerge.prepare.prepare_scene import prepare
-from gsmerge.prepare.prepared import Prepared
 from gsmerge.raster.metrics import decibels
 from gsmerge.results.distance import (
     DISTANCE_BLUR,
@@ -28,6 +27,7 @@ from gsmerge.results.distance import (
     describe_clear_loss,
     is_clearly_worse,
 )
+from gsmerge.viewpoints.place_cameras import between_cameras
 
 
 def make_room() -> Scene:

@@ -17,7 +17,7 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 import gsmerge
 from gsmerge.cli.console import say_notes
-from gsmerge.prepare.row_colors import ROW_COLORS
+from gsmerge.facts.pictures import ROW_COLORS
 from gsmerge.raster.photos import scene_pictures
 from gsmerge.runtime.documents import to_json
 from gsmerge.scoring.evaluate import INPUT, EvaluateOptions, Evaluation, evaluate, near_plane

@@ -12,12 +12,11 @@ from messages import refuses
 
 from gsmerge import Scene, compact
 from gsmerge.errors import UsageError
+from gsmerge.facts.scene_size import measure_size
 from gsmerge.geometry.frame import canonicalise, scene_frame
 from gsmerge.geometry.pooling import scene_members
 from gsmerge.plan.counts import FEW_PIXELS, superpixels_per_view
-from gsmerge.prepare.place_cameras import add_views
 from gsmerge.prepare.prepare_scene import prepare
-from gsmerge.prepare.scene_size import measure_size
 from gsmerge.prepare.true_pixels import with_pixels
 from gsmerge.runtime.record import record_run
 from gsmerge.settings.stages import SegmentOptions
@@ -25,6 +24,7 @@ from gsmerge.stages.assign import assign, find_owners, middle_pixels, owner_pixe
 from gsmerge.stages.encode import encode, member_rows
 from gsmerge.stages.superpixels import segment
 from gsmerge.types import NO_CAMERAS, Groups, make_scene
+from gsmerge.viewpoints.place_cameras import add_views
 
 
 def make_room() -> Scene:

@@ -11,12 +11,13 @@ from messages import noted, refuses
 
 from gsmerge import CompactOptions, Gaussians, Scene, compact, render
 from gsmerge.errors import UsageError
-from gsmerge.prepare.crop import crop_scene, inside_crop
-from gsmerge.prepare.support import count_views
+from gsmerge.geometry.regions import inside_crop
+from gsmerge.prepare.crop import crop_scene
 from gsmerge.raster.metrics import decibels
 from gsmerge.runtime.threads import use_threads
 from gsmerge.settings.stages import CleanOptions, parse_crop
 from gsmerge.stages.clean import clean, faintest_dropped, floater_share, floaters
+from gsmerge.viewpoints.support import count_views
 
 QUICK = {"fit": "none", "checkpoint": "none", "superpixels": 60, "poses": "fixed"}
 

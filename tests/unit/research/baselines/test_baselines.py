@@ -13,7 +13,7 @@ from messages import noted, refuses
 
 from gsmerge import CompactOptions, Gaussians, Scene, compact
 from gsmerge.errors import UsageError
-from gsmerge.prepare.row_colors import ROW_COLORS
+from gsmerge.facts.pictures import ROW_COLORS
 from gsmerge.results.result import CompactResult
 from gsmerge.runtime.plugins import METHODS, find_plugins, load_plugin
 from gsmerge.stages.superpixels import grid_labels

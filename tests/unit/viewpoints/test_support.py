@@ -9,10 +9,10 @@ import pytest
 import scenes
 
 from gsmerge import Gaussians
-from gsmerge.prepare.support import count_views
 from gsmerge.raster import composite, make_splats, tile_view
 from gsmerge.raster.photos import blank_photos
 from gsmerge.types import Cameras
+from gsmerge.viewpoints.support import count_views
 
 
 @pytest.fixture(scope="module")

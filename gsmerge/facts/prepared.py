@@ -8,13 +8,13 @@ from typing import Any, cast
 
 import numpy as np
 
+from gsmerge.facts.agreement import Agreement
+from gsmerge.facts.pictures import PHOTOS, RENDERS
+from gsmerge.facts.scene_size import SceneSize, measure_size, unlike_captures
 from gsmerge.frozen import dataclass, field, replace
 from gsmerge.geometry.frame import Frame, sample_rows
-from gsmerge.prepare.confirm_depths import Agreement
-from gsmerge.prepare.place_cameras import draw_around
-from gsmerge.prepare.row_colors import PHOTOS, RENDERS
-from gsmerge.prepare.scene_size import SceneSize, measure_size, unlike_captures
 from gsmerge.types import Cameras, PicturedScene, Scene
+from gsmerge.viewpoints.place_cameras import draw_around
 
 LEAST_VIEWS = 4  # fewest views with photos of which some are left out; of fewer views, too little would remain
 FLAT = 2 / 255  # a picture shows one flat colour if the range of its values is smaller

@@ -12,13 +12,13 @@ from gsmerge.geometry.transforms import motion_matrices, motion_vectors, nearest
 from gsmerge.geometry.views import concat_cameras, take_rows
 from gsmerge.kernels.elementary import cos, power, sin
 from gsmerge.kernels.matrices import matmul
-from gsmerge.prepare.viewer import GOLDEN, find_viewer, spread_directions
 from gsmerge.raster import contributions, make_splats, render, tile_view
 from gsmerge.raster.images import thin_out
 from gsmerge.raster.photos import blank_photos
 from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians, PicturedScene, Scene
+from gsmerge.viewpoints.viewer import GOLDEN, find_viewer, spread_directions
 
 NUM_VIEWS = 24  # largest number of cameras that are placed
 HELD_OUT = 8  # every HELD_OUT-th placed camera is not used in the fit, but only for scores

@@ -11,7 +11,7 @@ import unaligned_scenes
 from messages import noted
 
 from gsmerge import Gaussians, Scene, compact
-from gsmerge.prepare.scene_size import BRIGHT_COLOR, FEWEST_TESTED, LARGE_SCALE, unlike_captures
+from gsmerge.facts.scene_size import BRIGHT_COLOR, FEWEST_TESTED, LARGE_SCALE, unlike_captures
 
 FIT = {"superpixels": 50, "fit_steps": 5, "checkpoint": "none", "poses": "fixed"}
 

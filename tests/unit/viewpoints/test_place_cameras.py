@@ -11,10 +11,10 @@ import scenes
 from gsmerge import compact, render
 from gsmerge.geometry.transforms import rgb_to_sh0
 from gsmerge.kernels.elementary import cos, sin
-from gsmerge.prepare.place_cameras import add_views, place_inside, place_viewpoints
 from gsmerge.raster.metrics import psnr
 from gsmerge.runtime.record import record_run
 from gsmerge.types import NO_CAMERAS, Cameras, Gaussians, make_scene
+from gsmerge.viewpoints.place_cameras import add_views, place_inside, place_viewpoints
 
 PLACE = np.array([3.0, -2.0, 5.0])
 

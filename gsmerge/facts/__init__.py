@@ -1,0 +1,1 @@
+"""Facts about a scene that plans, stages and results depend on."""
