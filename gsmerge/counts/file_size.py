@@ -7,8 +7,7 @@ from collections.abc import Sequence
 from gsmerge.counts.clean_up import build_candidate
 from gsmerge.errors import UsageError
 from gsmerge.facts.prepared import Prepared
-from gsmerge.io.formats.rows import MIP_COMMENT, RESULT_COMMENT
-from gsmerge.io.formats.table import Contents, Format
+from gsmerge.plan.counts import FileSize
 from gsmerge.plan.plan import Plan
 from gsmerge.results.candidate import Candidate, rescore
 from gsmerge.runtime.memory import human_bytes
@@ -21,33 +20,22 @@ MOST_MEASURED = 8  # most files that are measured to choose how many Gaussians a
 MAX_REBUILDS = 2  # most builds after the first one
 
 
-def measure_bytes(gaussians: Gaussians, file: Format, cameras: Cameras, names: Sequence[str] = ()) -> int:
-    """Return how many bytes a file with these Gaussians and cameras has, or an upper bound if it is a page."""
-    comments = RESULT_COMMENT, MIP_COMMENT
-    if file.measure is not None:
-        return file.measure(gaussians, cameras, comments)
-    assert file.encode is not None  # all other formats have a fixed number of bytes for each Gaussian
-    contents = Contents([gaussians], comments, cameras if names else cameras[:0], names)
-    # Most bytes of the camera that is written if the scene has none, unless it is written to a file beside
-    placed_bytes = 700 * (file.first_view and not file.settings and not names)
-    return len(file.encode(gaussians, contents)) + placed_bytes
-
-
 def meet_bytes(candidate: Candidate, prepared: Prepared, plan: Plan) -> Candidate:
     """Make the file of a candidate nearly as large as a budget in bytes allows.
 
     The candidate is rebuilt with other counts until its file is about as large as allowed. The faintest Gaussians of
     the last build are dropped until the file fits.
     """
-    assert plan.count.file_size is not None, "a budget in bytes"
-    max_bytes, file = plan.count.file_size.num_bytes, plan.count.file_size.file
+    size = plan.count.file_size
+    assert size is not None, "a budget in bytes"
+    max_bytes = size.num_bytes
     names = prepared.input_scene.names
-    base_bytes = measure_least_bytes(candidate.gaussians, max_bytes, file, candidate.cameras, names)
+    base_bytes = measure_least_bytes(candidate.gaussians, size, candidate.cameras, names)
 
     def choose_next(built: Sequence[Candidate]) -> int | None:
         """Return the count whose file is expected to be as large as allowed; None if the last build is near enough."""
         last, count = built[-1], len(built[-1].gaussians)
-        num_bytes = measure_bytes(last.gaussians, file, last.cameras, names)
+        num_bytes = size.measure(last.gaussians, last.cameras, names)
         expected_count = int(BUILD_SURPLUS * count * (max_bytes - base_bytes) / max(num_bytes - base_bytes, 1))
         next_count = min(expected_count, plan.count.limits.most)
         # Gaussians that no view sees were dropped from the requested number, and no other Gaussians take their place
@@ -64,34 +52,33 @@ def meet_bytes(candidate: Candidate, prepared: Prepared, plan: Plan) -> Candidat
         candidate = build_candidate(prepared, plan, count)
         add_seconds(candidate.record.seconds)
         built.append(candidate)
-    gaussians = drop_to_bytes(candidate.gaussians, max_bytes, file, candidate.cameras, names, base_bytes)
+    gaussians = drop_to_bytes(candidate.gaussians, size, candidate.cameras, names, base_bytes)
     return candidate if len(gaussians) == len(candidate.gaussians) else rescore(candidate, gaussians, prepared, plan)
 
 
-def measure_least_bytes(
-    gaussians: Gaussians, max_bytes: int, file: Format, cameras: Cameras, names: Sequence[str] = ()
-) -> int:
-    """Return the bytes of a file with one Gaussian; UsageError if this file has more than ``max_bytes``."""
-    base_bytes = measure_bytes(gaussians[:1], file, cameras, names)
-    if base_bytes > max_bytes:
-        problem = f"expected at least {human_bytes(base_bytes)} for a {file.ending} with one Gaussian"
-        raise UsageError(f"budget: {problem}, got {human_bytes(max_bytes)}")
+def measure_least_bytes(gaussians: Gaussians, size: FileSize, cameras: Cameras, names: Sequence[str] = ()) -> int:
+    """Return the bytes of a file with one Gaussian; UsageError if this file is larger than ``size`` allows."""
+    base_bytes = size.measure(gaussians[:1], cameras, names)
+    if base_bytes > size.num_bytes:
+        problem = f"expected at least {human_bytes(base_bytes)} for a {size.ending} with one Gaussian"
+        raise UsageError(f"budget: {problem}, got {human_bytes(size.num_bytes)}")
     return base_bytes
 
 
 def drop_to_bytes(
-    gaussians: Gaussians, max_bytes: int, file: Format, cameras: Cameras, names: Sequence[str], base_bytes: int
+    gaussians: Gaussians, size: FileSize, cameras: Cameras, names: Sequence[str], base_bytes: int
 ) -> Gaussians:
-    """Keep about as many of the largest and most opaque Gaussians as fit into ``max_bytes``.
+    """Keep about as many of the largest and most opaque Gaussians as fit into a file of ``size``.
 
     ``base_bytes`` are the bytes of a file with one Gaussian.
     """
+    max_bytes = size.num_bytes
     fitting_count, most_count = 0, len(gaussians)  # the largest count that is known to fit, and the largest that may
     fitting, count = gaussians[:0], len(gaussians)
     full_share = 0.985  # a file with this share of ``max_bytes`` is full enough
     for _ in range(MOST_MEASURED):
         kept = gaussians if count == len(gaussians) else faintest_dropped(gaussians, count)
-        num_bytes = measure_bytes(kept, file, cameras, names)
+        num_bytes = size.measure(kept, cameras, names)
         if num_bytes <= max_bytes:
             fitting_count, fitting = count, kept
         else:

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from functools import partial
+
 from gsmerge.errors import UsageError
 from gsmerge.facts.agreement import FEWEST, Agreement
 from gsmerge.facts.scene_size import SceneSize
 from gsmerge.frozen import dataclass, replace
+from gsmerge.io.formats.measure import measure_bytes
 from gsmerge.io.formats.table import PLY, Format, count_for_bytes, output_format
 from gsmerge.runtime.record import note
 from gsmerge.settings.budget import AUTO, DEVICES, BudgetOptions, parse_budget, parse_bytes
 from gsmerge.settings.compact import OURS, CompactOptions
 from gsmerge.settings.stages import SHARE, DecodeOptions, SegmentOptions
 from gsmerge.stages.limits import CountLimits, count_for
+from gsmerge.types import Cameras, Gaussians
 
 # If a scene has neither photos nor pixels, its result has by default at least this PSNR (dB) against the input
 FIDELITY_PSNR = 32.5
@@ -86,8 +91,9 @@ def exact_count(options: BudgetOptions, num_input: int, sh_degree: int) -> int |
     if options.budget in (None, AUTO):
         return None
     limit = num_input if options.most is None else options.most
-    if size := file_size(options):
-        return min(count_for_bytes(size.file, size.num_bytes, sh_degree), limit)
+    file = _sized_format(options)
+    if file is not None:
+        return min(count_for_bytes(file, parse_bytes(str(options.budget)), sh_degree), limit)
     return min(parse_budget(str(options.budget), num_input), limit)
 
 
@@ -104,12 +110,10 @@ class FileSize:
     """Largest size of the output in bytes."""
 
     num_bytes: int
-    file: Format  # Format of the output
-
-    @property
-    def packed(self) -> bool:
-        """Return whether the size in bytes depends on the content, so that the file has to be made to measure it."""
-        return self.file.count is None
+    ending: str  # Of the output's name, which is that of its format
+    packed: bool  # The size depends on the content, so that the file has to be made to measure it
+    # Returns the bytes of a file with Gaussians, cameras, and names of these, or an upper bound if it is a page
+    measure: Callable[[Gaussians, Cameras, Sequence[str]], int]
 
 
 def file_size(options: BudgetOptions) -> FileSize | None:
@@ -117,12 +121,21 @@ def file_size(options: BudgetOptions) -> FileSize | None:
 
     Raises UsageError if the size of the output does not follow from the number of its Gaussians.
     """
+    file = _sized_format(options)
+    if file is None:
+        return None
+    num_bytes = parse_bytes(str(options.budget))
+    return FileSize(num_bytes, file.ending, packed=file.count is None, measure=partial(measure_bytes, file))
+
+
+def _sized_format(options: BudgetOptions) -> Format | None:
+    """Return the format of the output of a budget in bytes; None for any other budget. Raises as :func:`file_size`."""
     if not options.in_bytes:
         return None
     file = output_format(options.output or PLY.ending)
     if not file.gaussian_bytes:
         raise UsageError(f"budget: expected a number or a share of Gaussians for {file.ending}, got {options.budget}")
-    return FileSize(parse_bytes(str(options.budget)), file)
+    return file
 
 
 def max_allowed(options: BudgetOptions, num_input: int, sh_degree: int) -> int:
