@@ -42,7 +42,7 @@ DIAGONAL = ([0, 1, 2], [0, 1, 2])  # indices of the diagonal of a matrix [3,3]
 WATCHED = {  # functions that are recorded, by the module that calls them
     "gsmerge.reading.make_scene": ("find_pixels",),
     "gsmerge.run": ("make_plan", "build", "make_result"),
-    "gsmerge.pipeline": ("segment_scene", "correct", "match", "merge", "decode_merged", "fit_scene"),
+    "gsmerge.pipelines.pixel_rows": ("segment_scene", "correct", "match", "merge", "decode_merged", "fit_scene"),
 }
 ZOOM, STRIP, GAP = 4, 22, 6  # enlargement of photos, height of a title, and gap between panels, pixels
 DARK, BORDER = 0.45, (255, 255, 255)  # brightness of the photo under ellipses, and RGB colour of superpixel borders

@@ -1,9 +1,9 @@
 """A run, from its first function to its last: read -> prepare -> plan -> build -> score -> write.
 
 :func:`compact_files` reads and writes, :func:`compact_scene` prepares and plans, and :func:`compact_prepared` builds
-and scores. A plain run goes through these functions from top to bottom. :func:`gsmerge.pipeline.build` calls the stages
-in their order. Every other run, such as a search for the number of Gaussians, is one call behind an ``if``; its module
-calls ``build`` as often as it needs.
+and scores. A plain run goes through these functions from top to bottom. :func:`gsmerge.pipelines.pixel_rows.build` calls
+the stages in their order. Every other run, such as a search for the number of Gaussians, is one call behind an ``if``;
+its module calls ``build`` as often as it needs.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from gsmerge.io import atomic_outputs
 from gsmerge.io.formats.rows import result_comments
 from gsmerge.io.formats.table import Contents
 from gsmerge.io.formats.write import format_notes
-from gsmerge.pipeline import build
+from gsmerge.pipelines.pixel_rows import build
+from gsmerge.pipelines.plan import Plan
 from gsmerge.plan.blocks import choose_blocks
 from gsmerge.plan.forecast import run_parts
 from gsmerge.plan.make_plan import is_without_views, make_plan, note_ignored
-from gsmerge.plan.plan import Plan
 from gsmerge.prepare.crop import crop_scene
 from gsmerge.prepare.prepare_scene import prepare
 from gsmerge.prepare.steps import STEPS, without

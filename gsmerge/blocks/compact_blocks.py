@@ -27,11 +27,11 @@ from gsmerge.facts.scene_size import SceneSize
 from gsmerge.fit import fit_scene, peak_weights
 from gsmerge.geometry.frame import Frame, scene_frame
 from gsmerge.geometry.views import subset
+from gsmerge.pipelines.plan import Plan
 from gsmerge.plan.blocks import WHOLE_GAUSSIANS
 from gsmerge.plan.counts import file_size
 from gsmerge.plan.forecast import INPUT_STEPS, STAGE_STEPS
 from gsmerge.plan.make_plan import plan_scene
-from gsmerge.plan.plan import Plan
 from gsmerge.raster.metrics import SAMPLE_LOSS, describe_loss, is_worse
 from gsmerge.raster.photos import blank_photos
 from gsmerge.results.report import CompactReport

@@ -8,9 +8,9 @@ from gsmerge.blocks.partition import Block, Covisibility, owning_views
 from gsmerge.facts.prepared import Prepared
 from gsmerge.frozen import dataclass, replace
 from gsmerge.geometry.frame import Frame
-from gsmerge.pipeline import merge_views
+from gsmerge.pipelines.pixel_rows import merge_views
+from gsmerge.pipelines.plan import Plan
 from gsmerge.plan.make_plan import make_plan
-from gsmerge.plan.plan import Plan
 from gsmerge.prepare.prepare_scene import prepare
 from gsmerge.results.scores import measure_input
 from gsmerge.runtime.memory import free_pages, make_array

@@ -7,8 +7,7 @@ from collections.abc import Sequence
 from gsmerge.counts.clean_up import build_candidate
 from gsmerge.errors import UsageError
 from gsmerge.facts.prepared import Prepared
-from gsmerge.plan.counts import FileSize
-from gsmerge.plan.plan import Plan
+from gsmerge.pipelines.plan import FileSize, Plan
 from gsmerge.results.candidate import Candidate, rescore
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.record import add_seconds

@@ -12,10 +12,10 @@ from gsmerge.counts.file_size import meet_bytes
 from gsmerge.facts.pictures import PHOTOS, RENDERS
 from gsmerge.facts.prepared import LEAST_VIEWS, Prepared
 from gsmerge.kernels.elementary import exp, log, power
-from gsmerge.pipeline import build
+from gsmerge.pipelines.pixel_rows import build
+from gsmerge.pipelines.plan import CountPlan, Plan
 from gsmerge.plan.counts import FIDELITY_LOSS, level_counts
 from gsmerge.plan.forecast import STAGE_STEPS, run_parts
-from gsmerge.plan.plan import CountPlan, Plan
 from gsmerge.results.candidate import Candidate, score
 from gsmerge.results.left_out import LeftOut, choose_left_out, leave_out, mean_seen
 from gsmerge.results.scores import compares_all_pixels, may_leave_gaps, measure_input, measure_renders

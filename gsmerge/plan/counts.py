@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from functools import partial
 
 from gsmerge.errors import UsageError
 from gsmerge.facts.agreement import FEWEST, Agreement
 from gsmerge.facts.scene_size import SceneSize
-from gsmerge.frozen import dataclass, replace
+from gsmerge.frozen import replace
 from gsmerge.io.formats.measure import measure_bytes
 from gsmerge.io.formats.table import PLY, Format, count_for_bytes, output_format
+from gsmerge.pipelines.plan import FileSize
 from gsmerge.runtime.record import note
 from gsmerge.settings.budget import AUTO, DEVICES, BudgetOptions, parse_budget, parse_bytes
 from gsmerge.settings.compact import OURS, CompactOptions
 from gsmerge.settings.stages import SHARE, DecodeOptions, SegmentOptions
 from gsmerge.stages.limits import CountLimits, count_for
-from gsmerge.types import Cameras, Gaussians
 
 # If a scene has neither photos nor pixels, its result has by default at least this PSNR (dB) against the input
 FIDELITY_PSNR = 32.5
@@ -103,17 +102,6 @@ def level_counts(finest: int, num_levels: int, least: int = 1) -> list[int]:
     ``num_levels`` is the number of all levels, of which the finest has ``finest`` Gaussians.
     """
     return [count for level in range(1, num_levels) if (count := finest // LEVEL_FACTOR**level) >= least]
-
-
-@dataclass(frozen=True)
-class FileSize:
-    """Largest size of the output in bytes."""
-
-    num_bytes: int
-    ending: str  # Of the output's name, which is that of its format
-    packed: bool  # The size depends on the content, so that the file has to be made to measure it
-    # Returns the bytes of a file with Gaussians, cameras, and names of these, or an upper bound if it is a page
-    measure: Callable[[Gaussians, Cameras, Sequence[str]], int]
 
 
 def file_size(options: BudgetOptions) -> FileSize | None:

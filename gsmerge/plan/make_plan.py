@@ -16,6 +16,7 @@ from gsmerge.facts.scene_size import SceneSize
 from gsmerge.fit import start_share
 from gsmerge.frozen import replace
 from gsmerge.geometry.views import pick_views, scored_views
+from gsmerge.pipelines.plan import CountPlan, MergePlan, Plan, ScorePlan
 from gsmerge.plan.counts import (
     FIDELITY_PSNR,
     count_limits,
@@ -28,7 +29,6 @@ from gsmerge.plan.counts import (
 from gsmerge.plan.efforts import EFFORTS
 from gsmerge.plan.fit import SHORT_STEPS, fit_to_pictures, resolve_fit
 from gsmerge.plan.networks import choose_networks, cuts_views, load_networks
-from gsmerge.plan.plan import CountPlan, MergePlan, Plan, ScorePlan
 from gsmerge.raster.photos import scored_tiles
 from gsmerge.runtime.record import note, stage
 from gsmerge.settings.budget import AUTO

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from gsmerge.errors import UsageError
 from gsmerge.facts.prepared import Prepared
 from gsmerge.frozen import dataclass
-from gsmerge.plan.plan import Plan
+from gsmerge.pipelines.plan import Plan
 from gsmerge.prepare.prepare_scene import prepare
 from gsmerge.runtime.plugins import METHODS, load_plugin
 from gsmerge.runtime.record import note

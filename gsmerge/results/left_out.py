@@ -11,8 +11,8 @@ from gsmerge.facts.pictures import PHOTOS
 from gsmerge.facts.prepared import Prepared, Reference
 from gsmerge.frozen import dataclass, replace
 from gsmerge.geometry.views import pick_views, subset
+from gsmerge.pipelines.plan import Plan
 from gsmerge.plan.make_plan import make_plan
-from gsmerge.plan.plan import Plan
 from gsmerge.raster.photos import NEAR_PLANE, Photos, scene_photos, score_photos
 from gsmerge.scoring.visibility import context_points, visible_pixels
 from gsmerge.settings.compact import OURS, TRIAL, CompactOptions

@@ -17,8 +17,8 @@ from gsmerge.facts.prepared import Prepared
 from gsmerge.frozen import dataclass, field, replace
 from gsmerge.io.formats.rows import result_comments
 from gsmerge.io.formats.table import Contents
+from gsmerge.pipelines.plan import Plan
 from gsmerge.plan.make_plan import own_views
-from gsmerge.plan.plan import Plan
 from gsmerge.raster.metrics import SAMPLE_LOSS, describe_distance, describe_loss, is_worse
 from gsmerge.results.candidate import Candidate, rescore, with_moved_views
 from gsmerge.results.distance import describe_clear_loss, is_clearly_worse

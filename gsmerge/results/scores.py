@@ -11,7 +11,7 @@ from gsmerge.facts.prepared import Prepared
 from gsmerge.frozen import dataclass, replace
 from gsmerge.geometry.views import scored_views
 from gsmerge.io.formats.write import round_as_written
-from gsmerge.plan.plan import ScorePlan
+from gsmerge.pipelines.plan import ScorePlan
 from gsmerge.raster.photos import NEAR_PLANE, WHOLE_SHARE, PhotoScore, scene_photos, score_photos
 from gsmerge.results.report import Covered, PhotoFiles
 from gsmerge.runtime.record import stage

@@ -28,10 +28,11 @@ def functions(text: str) -> Iterator[ast.FunctionDef]:
     yield from (node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.FunctionDef))
 
 
-def test_the_pipeline_nests_no_functions() -> None:
+def test_pipelines_nest_no_functions() -> None:
     nested = [
         inner.name
-        for outer in functions(texts()[PACKAGE / "pipeline.py"])
+        for text in texts("pipelines").values()
+        for outer in functions(text)
         for inner in ast.walk(outer)
         if isinstance(inner, ast.FunctionDef) and inner is not outer
     ]

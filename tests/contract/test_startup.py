@@ -41,7 +41,7 @@ assert main(["compact", "room", "--magic"]) == 2
 loaded, kinds = [m for m in sys.modules if "." not in m], []
 import gsmerge.raster, gsmerge.jobs.inspect
 kinds += [type(gsmerge.render).__name__, type(gsmerge.inspect).__name__]
-import gsmerge.pipeline
+import gsmerge.pipelines.pixel_rows
 kinds += [type(gsmerge.render).__name__, type(gsmerge.inspect).__name__]
 print()
 for words in (one, loaded, kinds):
@@ -70,7 +70,7 @@ assert main({arguments[1]!r}) == 0
 """
     heavy = ("linalg", "ndimage", "optimize", "spatial", "sparse")
     never = {"torch", "skimage", "matplotlib", "pydantic", *(f"scipy.{name}" for name in heavy)}
-    (loaded,) = (line for line in run_python(code).splitlines() if "gsmerge.pipeline" in line)
+    (loaded,) = (line for line in run_python(code).splitlines() if "gsmerge.pipelines.pixel_rows" in line)
     assert never.isdisjoint(loaded.split())
     assert outputs[0].read_bytes() == outputs[1].read_bytes()
 

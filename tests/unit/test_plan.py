@@ -23,13 +23,13 @@ from gsmerge.geometry.frame import canonicalise
 from gsmerge.geometry.views import REPORT_VIEWS
 from gsmerge.jobs.estimate import estimate
 from gsmerge.networks.checkpoint import IN_PACKAGE
+from gsmerge.pipelines.plan import Plan
 from gsmerge.plan.counts import FIDELITY_LOSS, FIDELITY_PSNR, resolve_budget
 from gsmerge.plan.efforts import EFFORTS
 from gsmerge.plan.fit import steps_for
 from gsmerge.plan.forecast import LEVEL_SHARE, run_parts
 from gsmerge.plan.make_plan import is_without_views, make_plan, plan_scene
 from gsmerge.plan.networks import choose_networks
-from gsmerge.plan.plan import Plan
 from gsmerge.prepare.confirm_depths import confirm_depths
 from gsmerge.prepare.prepare_scene import prepare
 from gsmerge.results.candidate import score

@@ -17,7 +17,7 @@ from gsmerge.fit.outside import STEP_BACK_HIGH, STEP_BACK_LOW, outside_cameras
 from gsmerge.fit.report import FitReport
 from gsmerge.geometry.transforms import camera_centres
 from gsmerge.jobs.estimate import estimate
-from gsmerge.pipeline import build
+from gsmerge.pipelines.pixel_rows import build
 from gsmerge.plan.make_plan import make_plan, plan_scene
 from gsmerge.prepare.prepare_scene import prepare
 from gsmerge.raster.metrics import psnr

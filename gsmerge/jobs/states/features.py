@@ -32,7 +32,7 @@ from gsmerge.networks.checkpoint import Checkpoint
 from gsmerge.networks.cross_view_stats import cross_view_stats
 from gsmerge.networks.tokens import GroupFeatures, describe_features, make_group_features
 from gsmerge.networks.weights import NetworkWeights
-from gsmerge.pipeline import encode_groups
+from gsmerge.pipelines.pixel_rows import encode_groups
 from gsmerge.plan.make_plan import make_plan
 from gsmerge.prepare.prepare_scene import prepare
 from gsmerge.prepare.steps import without

@@ -17,8 +17,8 @@ from gsmerge.facts.pictures import PHOTOS
 from gsmerge.facts.prepared import Prepared
 from gsmerge.fit import FitOptions, Fitted
 from gsmerge.kernels import elementary
+from gsmerge.pipelines.plan import CountPlan, Plan
 from gsmerge.plan.counts import FIDELITY_LOSS, exact_count, level_counts, max_allowed
-from gsmerge.plan.plan import CountPlan, Plan
 from gsmerge.results.candidate import Candidate
 from gsmerge.results.left_out import LeftOut
 from gsmerge.runtime.record import Record

@@ -13,10 +13,11 @@ import scenes
 from messages import refuses
 
 import gsmerge
-from gsmerge import Gaussians, Scene, compact, pipeline, render
+from gsmerge import Gaussians, Scene, compact, render
 from gsmerge.errors import TargetError
 from gsmerge.facts.prepared import Prepared
 from gsmerge.geometry.views import resize_cameras
+from gsmerge.pipelines import pixel_rows
 from gsmerge.prepare.prepare_scene import prepare
 from gsmerge.raster.metrics import decibels
 from gsmerge.results.distance import (
@@ -90,14 +91,14 @@ def test_clearly_worse_is_twice_the_error(before: float | None, after: float | N
 
 def spoil_fits(monkeypatch: pytest.MonkeyPatch, *, merges: bool) -> None:
     """Let every fit end in nearly nothing, and with ``merges`` the merge without a fit as well."""
-    fit_scene = pipeline.fit_scene
+    fit_scene = pixel_rows.fit_scene
 
     def spoilt(start: Any, scene: Any, options: Any, seed: int, **rest: Any) -> Any:
         fitted = fit_scene(start, scene, options, seed, **rest)
         is_kept = options.fit == "none" and not merges
         return fitted if is_kept else replace(fitted, gaussians=nearly_nothing(fitted.gaussians))
 
-    monkeypatch.setattr(pipeline, "fit_scene", spoilt)
+    monkeypatch.setattr(pixel_rows, "fit_scene", spoilt)
 
 
 def test_a_run_is_made_again_without_the_fit_that_spoiled_it(room: Scene, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,25 +6,35 @@ its own part.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from gsmerge.facts.prepared import Prepared
 from gsmerge.frozen import dataclass, replace
-from gsmerge.plan.counts import FileSize
 from gsmerge.settings.fit import FitOptions
 from gsmerge.settings.stages import CleanOptions, DecodeOptions, MatchOptions
 from gsmerge.stages.limits import CountLimits
 from gsmerge.stages.pair_merge import POWERS
 from gsmerge.stages.segment import SuperpixelChoices
-from gsmerge.types import Gaussians
+from gsmerge.types import Cameras, Gaussians
 
 if TYPE_CHECKING:
     from gsmerge.networks.checkpoint import Checkpoint
     from gsmerge.networks.weights import NetworkWeights
     from gsmerge.raster.photos import PhotoScore
+
+
+@dataclass(frozen=True)
+class FileSize:
+    """Largest size of the output in bytes."""
+
+    num_bytes: int
+    ending: str  # Of the output's name, which is that of its format
+    packed: bool  # The size depends on the content, so that the file has to be made to measure it
+    # Returns the bytes of a file with Gaussians, cameras, and names of these, or an upper bound if it is a page
+    measure: Callable[[Gaussians, Cameras, Sequence[str]], int]
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,7 @@ from gsmerge.facts.prepared import Prepared
 from gsmerge.fit import Fitted, fit_scene
 from gsmerge.geometry.pooling import Members
 from gsmerge.networks.corrector import ANALYTIC, Corrector
-from gsmerge.plan.plan import MergePlan, Plan
+from gsmerge.pipelines.plan import MergePlan, Plan
 from gsmerge.runtime.record import record_choices
 from gsmerge.stages.assign import assign
 from gsmerge.stages.decode import decode_merged
