@@ -28,6 +28,7 @@ from skimage.segmentation import find_boundaries
 
 import gsmerge
 from gsmerge.geometry.transforms import IDENTITY, covariances, project
+from gsmerge.pipelines.pixel_rows import PIXEL_ROWS
 from gsmerge.research.generate import GenerateOptions, NoiseOptions, generate_scene
 
 DOCS = Path(__file__).parent
@@ -303,7 +304,7 @@ def first_steps(run: Run) -> list[str]:
             say(
                 f"The fit starts with only {first} superpixels of each view, because it adds Gaussians itself where"
                 " renders differ most from the photos.",
-                plan.fit.grows and not plan.merges_pairs,
+                plan.fit.grows and plan.pipeline == PIXEL_ROWS,
             ),
             say(
                 "Networks are not used, because a fit to photos gains more.",

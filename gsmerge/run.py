@@ -1,7 +1,7 @@
 """A run, from its first function to its last: read -> prepare -> plan -> build -> score -> write.
 
 :func:`compact_files` reads and writes, :func:`compact_scene` prepares and plans, and :func:`compact_prepared` builds
-and scores. A plain run goes through these functions from top to bottom. :func:`gsmerge.pipelines.pixel_rows.build` calls
+and scores. A plain run goes through these functions from top to bottom. :func:`gsmerge.pipelines.build.build` calls
 the stages in their order. Every other run, such as a search for the number of Gaussians, is one call behind an ``if``;
 its module calls ``build`` as often as it needs.
 """
@@ -23,7 +23,7 @@ from gsmerge.io import atomic_outputs
 from gsmerge.io.formats.rows import result_comments
 from gsmerge.io.formats.table import Contents
 from gsmerge.io.formats.write import format_notes
-from gsmerge.pipelines.pixel_rows import build
+from gsmerge.pipelines.build import build, make_pipeline
 from gsmerge.pipelines.plan import Plan
 from gsmerge.plan.blocks import choose_blocks
 from gsmerge.plan.forecast import run_parts
@@ -193,7 +193,7 @@ def plan_run(scene: Scene, options: CompactOptions) -> tuple[Prepared, Plan]:
 
         method = choose_method(options, scene)
         prepared = method.prepare(scene.numpy(), options.prepare)
-        return prepared, make_plan(prepared, options, run=method.run)
+        return prepared, make_plan(prepared, options, pipeline=make_pipeline(method.name, method.run))
     note_ignored(scene, options)
     steps = without("pixels") if is_without_views(scene, options) else STEPS
     prepared = prepare(scene.numpy(), options.prepare, steps=steps)

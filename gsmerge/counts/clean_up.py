@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from gsmerge.facts.prepared import Prepared
 from gsmerge.fit import Fitted
-from gsmerge.pipelines.pixel_rows import build
+from gsmerge.pipelines.build import build
 from gsmerge.pipelines.plan import Plan
 from gsmerge.results.candidate import Candidate, score
 from gsmerge.runtime.record import Record, add_seconds, adopt, begin_part, note, record_choices, record_part

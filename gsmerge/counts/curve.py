@@ -17,7 +17,7 @@ from gsmerge.facts.prepared import Prepared
 from gsmerge.fit.photo_sizes import holdout_psnr, training_weights
 from gsmerge.frozen import dataclass, replace
 from gsmerge.kernels.elementary import log, power
-from gsmerge.pipelines.pixel_rows import build
+from gsmerge.pipelines.build import build
 from gsmerge.pipelines.plan import Plan
 from gsmerge.raster.metrics import WINDOW, ssim
 from gsmerge.raster.photos import Photos, render_photos, scene_photos

@@ -12,7 +12,7 @@ from gsmerge.counts.file_size import meet_bytes
 from gsmerge.facts.pictures import PHOTOS, RENDERS
 from gsmerge.facts.prepared import LEAST_VIEWS, Prepared
 from gsmerge.kernels.elementary import exp, log, power
-from gsmerge.pipelines.pixel_rows import build
+from gsmerge.pipelines.build import build
 from gsmerge.pipelines.plan import CountPlan, Plan
 from gsmerge.plan.counts import FIDELITY_LOSS, level_counts
 from gsmerge.plan.forecast import STAGE_STEPS, run_parts

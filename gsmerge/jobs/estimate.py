@@ -16,6 +16,7 @@ from gsmerge.frozen import dataclass
 from gsmerge.geometry.frame import canonicalise
 from gsmerge.io.formats.ply import file_bytes
 from gsmerge.io.formats.table import find_format
+from gsmerge.pipelines.bare_rows import BARE_ROWS
 from gsmerge.plan.blocks import choose_blocks
 from gsmerge.plan.counts import FIDELITY_LOSS, FIDELITY_PSNR, level_counts, resolve_budget
 from gsmerge.plan.forecast import TRIAL_SHARE, usual_builds
@@ -155,7 +156,7 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
         "bytes": file_bytes(count, scene.gaussians.sh_degree),
         "blocks": num_blocks,
         "method": options.method,
-        "superpixels_per_view": 0 if plan.merges_pairs else None if is_distributed else limits.per_view,
+        "superpixels_per_view": 0 if plan.pipeline == BARE_ROWS else None if is_distributed else limits.per_view,
         **{name: settings[name] for name in ("k", "match", "checkpoint")},
         "fit": fit,
         "fit_steps": plan.fit.steps,

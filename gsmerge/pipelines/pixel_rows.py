@@ -1,4 +1,4 @@
-"""The stages in their order, from a prepared scene to the Gaussians of a result.
+"""The pipeline of rows that are pixels, or that photos show: the stages in their order.
 
 scene -> groups -> Feature Gaussians -> merged -> refined -> decoded -> fitted -> pruned -> filled
 """
@@ -12,7 +12,7 @@ from gsmerge.facts.prepared import Prepared
 from gsmerge.fit import Fitted, fit_scene
 from gsmerge.geometry.pooling import Members
 from gsmerge.networks.corrector import ANALYTIC, Corrector
-from gsmerge.pipelines.plan import MergePlan, Plan
+from gsmerge.pipelines.plan import MergePlan, Pipeline, Plan
 from gsmerge.runtime.record import record_choices
 from gsmerge.stages.assign import assign
 from gsmerge.stages.decode import decode_merged
@@ -25,7 +25,7 @@ from gsmerge.stages.segment import segment_scene
 from gsmerge.types import Decoded, FeatureGaussians, Gaussians, Groups, PicturedScene
 
 
-def build(prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
+def build_from_pixels(prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
     """Build and fit ``count`` canonical Gaussians; None: ``superpixels`` and K decide the number.
 
     After the fit, the Gaussians that no view sees are dropped, and gaps between the views are filled with at most as
@@ -33,15 +33,6 @@ def build(prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
     empty, as after a crop. If the plan has to fill the budget, or drops nothing, only as many unseen Gaussians are
     dropped as new Gaussians are added. Trials and an unchanged input are returned as they are.
     """
-    if plan.run is not None:  # the method of another package
-        gaussians = plan.run(prepared, plan, plan.count.limits.default if count is None else count)
-        return Fitted(gaussians, prepared.scene.cameras, None)
-    if plan.merges_pairs:
-        from gsmerge.stages.fit_pairs import build_pairs
-
-        return build_pairs(
-            prepared, plan.count.limits.default if count is None else count, plan.merge.power, plan.fit, plan.seed
-        )
     scene, start = prepared.scene, merge_views(prepared, plan, count)
     if start.is_input and (plan.fit.fit == "none" or prepared.reference.name == RENDERS):
         return Fitted(start.gaussians, scene.cameras, None)  # the pictures show exactly these Gaussians
@@ -60,6 +51,9 @@ def build(prepared: Prepared, plan: Plan, count: int | None) -> Fitted:
         most = start.count if plan.fit.grows else len(start.gaussians)
         record_choices(pruned=max(0, most - len(gaussians)))
     return replace(fitted, gaussians=gaussians)
+
+
+PIXEL_ROWS = Pipeline("pixel rows", build_from_pixels)
 
 
 def merge_views(prepared: Prepared, plan: Plan, count: int | None) -> Decoded:

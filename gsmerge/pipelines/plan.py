@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gsmerge.facts.prepared import Prepared
+from gsmerge.fit import Fitted
 from gsmerge.frozen import dataclass, replace
 from gsmerge.settings.fit import FitOptions
 from gsmerge.settings.stages import CleanOptions, DecodeOptions, MatchOptions
@@ -103,6 +104,14 @@ class ScorePlan:
     covered: tuple[np.ndarray, ...] | None = None
 
 
+@dataclass(frozen=True)
+class Pipeline:
+    """A way from a prepared scene to the fitted Gaussians of a result."""
+
+    name: str
+    build: Callable[[Prepared, Plan, int | None], Fitted]  # builds a number of Gaussians; None: the usual number
+
+
 @dataclass(frozen=True, eq=False)
 class Plan:
     """All decisions about a run, made before the first superpixel is cut."""
@@ -112,12 +121,10 @@ class Plan:
     fit: FitOptions  # How they are fitted to the photos
     score: ScorePlan  # How results are scored
     clean: CleanOptions  # What is left out of the result
-    merges_pairs: bool  # Merge neighbours pair by pair instead of superpixels
+    pipeline: Pipeline  # How Gaussians are built
     seed: int  # All random choices depend on this number alone
     settings: dict[str, Any]  # All settings by flat name, for reports
     free_poses: bool = False  # The options ask the fit to move cameras, even if the scene does not need it
-    # How another package builds a number of Gaussians; None: gsmerge's own stages build them
-    run: Callable[[Prepared, Plan, int], Gaussians] | None = None
     is_trial: bool = False  # The result is only scored on left-out photos, so gaps need not be filled
 
     @property

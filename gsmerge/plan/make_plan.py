@@ -6,7 +6,6 @@ no computation, for estimates and for scenes in blocks.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from gsmerge.errors import UsageError
@@ -16,7 +15,9 @@ from gsmerge.facts.scene_size import SceneSize
 from gsmerge.fit import start_share
 from gsmerge.frozen import replace
 from gsmerge.geometry.views import pick_views, scored_views
-from gsmerge.pipelines.plan import CountPlan, MergePlan, Plan, ScorePlan
+from gsmerge.pipelines.bare_rows import BARE_ROWS
+from gsmerge.pipelines.pixel_rows import PIXEL_ROWS
+from gsmerge.pipelines.plan import CountPlan, MergePlan, Pipeline, Plan, ScorePlan
 from gsmerge.plan.counts import (
     FIDELITY_PSNR,
     count_limits,
@@ -38,7 +39,7 @@ from gsmerge.settings.setting import flat_settings
 from gsmerge.settings.stages import SHARE, USUAL_K, DecodeOptions, MatchOptions, PrepareOptions, SegmentOptions
 from gsmerge.stages.fit_pairs import choose_power
 from gsmerge.stages.segment import SharedTree, SuperpixelChoices
-from gsmerge.types import Gaussians, Scene
+from gsmerge.types import Scene
 
 if TYPE_CHECKING:
     from gsmerge.networks.checkpoint import Checkpoint
@@ -48,16 +49,13 @@ LONE_K = 4  # K if all views have the same camera, because no other view adds Ga
 
 
 def make_plan(
-    prepared: Prepared,
-    options: CompactOptions,
-    checkpoint: Checkpoint | None = None,
-    run: Callable[[Prepared, Plan, int], Gaussians] | None = None,
+    prepared: Prepared, options: CompactOptions, checkpoint: Checkpoint | None = None, pipeline: Pipeline | None = None
 ) -> Plan:
     """Make all decisions about a run that the options leave open.
 
     The networks are also loaded, because some decisions depend on them. ``checkpoint`` has networks to use instead of
-    the networks that the options name. ``run`` is the field of :class:`Plan`. Raises UsageError if the scene or the
-    networks do not allow what the options ask for.
+    the networks that the options name. ``pipeline`` is that of another package's method. Raises UsageError if the scene
+    or the networks do not allow what the options ask for.
     """
     check_pictures(prepared, options)
     with stage("prepare"):
@@ -66,8 +64,11 @@ def make_plan(
         filled = fill_options(prepared, options)
         has_repeats = len(prepared.scene) < len(prepared.input_scene)
         num_input = prepared.input_scene.num_gaussians if has_repeats else None  # a budget may be a share of it
-        plan = plan_scene(size, filled, num_input=num_input, keeps=keeps_fidelity(size, options))
-        merges_pairs = plan.merges_pairs and checkpoint is None
+        plan = plan_scene(
+            size, filled, num_input=num_input, keeps=keeps_fidelity(size, options),
+            has_networks=checkpoint is not None, pipeline=pipeline,
+        )  # fmt: skip
+        merges_pairs = plan.pipeline == BARE_ROWS
         cuts = cuts_views(options, size)
         fit = fit_to_pictures(prepared, filled, plan.fit, merges_pairs=merges_pairs)
         if plan.count.keeps_fidelity and has_few_rows(size):
@@ -79,9 +80,7 @@ def make_plan(
             merge=plan_merge(prepared, plan, fit, checkpoint, merges_pairs=merges_pairs, cuts=cuts),
             fit=fit,
             score=plan_scores(prepared, plan, EFFORTS[options.effort].report_views),
-            merges_pairs=merges_pairs,
             settings=replace(options, decode=plan.merge.decode).to_dict() | {"fit_steps": fit.steps},
-            run=run,
         )
 
 
@@ -119,13 +118,20 @@ def plan_scores(prepared: Prepared, plan: Plan, report_views: int) -> ScorePlan:
 
 
 def plan_scene(
-    size: SceneSize, options: CompactOptions, *, num_input: int | None = None, keeps: bool | None = None
+    size: SceneSize,
+    options: CompactOptions,
+    *,
+    num_input: int | None = None,
+    keeps: bool | None = None,
+    has_networks: bool = False,
+    pipeline: Pipeline | None = None,
 ) -> Plan:
     """Make the decisions that follow from the scene's size and the options; UsageError for impossible options.
 
     Estimates, and scenes in blocks, need no more; :func:`make_plan` adds what follows from the pictures. ``num_input``:
     see :func:`gsmerge.plan.counts.count_limits`. ``keeps``: what :func:`keeps_fidelity` has returned for the options
-    of the caller; None: what this function returns for ``options``.
+    of the caller; None: what this function returns for ``options``. With ``has_networks``, networks are given, also if
+    the options name none. ``pipeline`` is that of another package's method.
     """
     effort = EFFORTS[options.effort]
     budget = options.budget
@@ -143,10 +149,6 @@ def plan_scene(
     fit = resolve_fit(options, size, limits)
     match = options.match.match or ("overlap" if effort.merges else "none")
     networks = choose_networks(replace(options, fit=fit), size)
-    # Views are cut into superpixels if they have pictures other than renders, or if a setting changes superpixels. A
-    # setting of the number of superpixels does not count, because it only says how many Gaussians there are. Without
-    # superpixels, neighbouring Gaussians are merged pair by pair
-    cuts = size.num_views > 0 and (not size.rendered or options.changes_superpixels)
     # Without a fit, new views look as good as the views of the input, so they need no estimate
     new_views = fit.fit != "none" and options.effort != "draft" if options.new_views is None else options.new_views
     return Plan(
@@ -166,11 +168,22 @@ def plan_scene(
         fit=fit,
         score=ScorePlan(output=budget.output, new_views=new_views),
         clean=options.clean,
-        merges_pairs=options.method == OURS and networks == "none" and not cuts,
+        pipeline=pipeline or choose_pipeline(size, options, has_networks=has_networks or networks != "none"),
         seed=options.seed,
         settings=options.to_dict() | {"k": decode.k, "match": match, "checkpoint": networks},
         free_poses=options.prepare.poses == "free",
     )
+
+
+def choose_pipeline(size: SceneSize, options: CompactOptions, *, has_networks: bool) -> Pipeline:
+    """Choose how Gaussians are built: by superpixels, or by pairs of neighbours.
+
+    Views are cut into superpixels if they have pictures other than renders, or if a setting changes superpixels. A
+    setting of the number of superpixels does not count, because it only says how many Gaussians there are. Networks
+    need superpixels, too. Without superpixels, neighbouring Gaussians are merged pair by pair.
+    """
+    cuts = size.num_views > 0 and (not size.rendered or options.changes_superpixels)
+    return PIXEL_ROWS if cuts or has_networks or options.method != OURS else BARE_ROWS
 
 
 def is_without_views(scene: Scene, options: CompactOptions) -> bool:

@@ -59,7 +59,7 @@ class LeftOut:
         settings = plan.settings | TRIAL | settings
         # without networks in the plan, the settings must not ask for any
         settings |= {"method": OURS, "checkpoint": "none"} if plan.merge.checkpoint is None else {}
-        return make_plan(self.rest, CompactOptions().with_settings(settings), plan.merge.checkpoint, plan.run)
+        return make_plan(self.rest, CompactOptions().with_settings(settings), plan.merge.checkpoint, plan.pipeline)
 
 
 def leave_out(scene: PicturedScene, views: Sequence[int], prepared: Prepared) -> LeftOut | None:

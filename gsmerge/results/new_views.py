@@ -17,7 +17,7 @@ from gsmerge.frozen import dataclass, replace
 from gsmerge.geometry.transforms import camera_distances
 from gsmerge.geometry.views import subset
 from gsmerge.kernels.elementary import power
-from gsmerge.pipelines.pixel_rows import build
+from gsmerge.pipelines.build import build
 from gsmerge.pipelines.plan import Plan
 from gsmerge.raster.photos import shrink_pictures
 from gsmerge.results.left_out import LEAST_SEEN, choose_left_out, leave_out, mean_seen

@@ -48,17 +48,6 @@ def merge_scene(count: int, power: float, prepared: Prepared) -> Decoded:
     return Decoded(gaussians, count, exact=True, is_input=gaussians is prepared.scene.gaussians)
 
 
-def build_pairs(prepared: Prepared, count: int, power: float, options: FitOptions, seed: int) -> Fitted:
-    """Merge neighbouring Gaussians pair by pair until ``count`` remain, and fit them to renders of the scene.
-
-    A scene of at most ``count`` Gaussians is returned unchanged, because its renders show exactly these Gaussians.
-    """
-    start = merge_scene(count, power, prepared)
-    if start.is_input:
-        return Fitted(start.gaussians, prepared.scene.cameras, None)
-    return fit_around(start, prepared, options, seed)
-
-
 def fit_around(start: Decoded, prepared: Prepared, options: FitOptions, seed: int) -> Fitted:
     """Fit Gaussians to renders of the scene from its views and, in a long fit, from cameras around the views.
 

@@ -17,7 +17,9 @@ from gsmerge.fit.outside import STEP_BACK_HIGH, STEP_BACK_LOW, outside_cameras
 from gsmerge.fit.report import FitReport
 from gsmerge.geometry.transforms import camera_centres
 from gsmerge.jobs.estimate import estimate
-from gsmerge.pipelines.pixel_rows import build
+from gsmerge.pipelines.bare_rows import BARE_ROWS
+from gsmerge.pipelines.build import build
+from gsmerge.pipelines.pixel_rows import PIXEL_ROWS
 from gsmerge.plan.make_plan import make_plan, plan_scene
 from gsmerge.prepare.prepare_scene import prepare
 from gsmerge.raster.metrics import psnr
@@ -127,11 +129,11 @@ def test_counts_and_cameras_are_as_asked_for(settings: dict[str, object], scene:
 
 def test_the_plan_and_its_estimate_say_so(scene: Scene) -> None:
     size = measure_size(scene)
-    assert plan_scene(size, CompactOptions()).merges_pairs
+    assert plan_scene(size, CompactOptions()).pipeline == BARE_ROWS
     assert estimate(scene, CompactOptions())["superpixels_per_view"] == 0
     for settings in ({"max_color": 0.11}, {"segmentation": "grid"}, {"checkpoint": "shipped"}, {"method": "greedy"}):
-        assert not plan_scene(size, CompactOptions().with_settings(settings)).merges_pairs
-    assert not plan_scene(replace(size, rendered=False), CompactOptions()).merges_pairs
+        assert plan_scene(size, CompactOptions().with_settings(settings)).pipeline == PIXEL_ROWS
+    assert plan_scene(replace(size, rendered=False), CompactOptions()).pipeline == PIXEL_ROWS
 
 
 def test_cameras_between_stand_half_way_and_look_at_the_same(scene: Scene) -> None:
