@@ -9,7 +9,7 @@ from setuptools.command.bdist_wheel import bdist_wheel
 from setuptools.command.build import build
 
 ROOT = Path(__file__).parent
-SPEC = importlib.util.spec_from_file_location("native_build", ROOT / "gsmerge" / "kernels" / "build.py")
+SPEC = importlib.util.spec_from_file_location("native_build", ROOT / "gsmerge" / "method" / "kernels" / "build.py")
 native_build = sys.modules[SPEC.name] = importlib.util.module_from_spec(SPEC)
 SPEC.loader.exec_module(native_build)
 
@@ -28,7 +28,7 @@ class BuildNative(Command):
         self.set_undefined_options("build", ("build_lib", "build_lib"))
 
     def run(self):
-        folder = native_build.FOLDER if self.editable_mode else Path(self.build_lib, "gsmerge", "kernels")
+        folder = native_build.FOLDER if self.editable_mode else Path(self.build_lib, "gsmerge", "method", "kernels")
         wheel = self.distribution.command_obj.get("bdist_wheel")
         built = native_build.build_libraries(folder, platform=wheel.plat_name if wheel else None)
         for path in set(folder.glob("kernels-*")) - set(built):  # of an earlier build for another platform

@@ -28,7 +28,7 @@ TASKS: dict[str, tuple[tuple[str, ...], ...]] = {  # the calls of each task
     "demo": (MAKE_VENV, (*INSTALL, "."), *MAIN_JOB),
     "main-job": MAIN_JOB,  # the demo with a package that is installed already
     "setup": (MAKE_VENV, (*INSTALL, ".[test]")),
-    "native": (("python", "gsmerge/kernels/build.py"),),
+    "native": (("python", "gsmerge/method/kernels/build.py"),),
     "tests": (("python", "-m", "pytest"),),
     "sweeps": (("python", "-m", "pytest", "-m", "slow"),),
     "processors": (("python", "tools/processors.py"),),

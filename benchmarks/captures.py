@@ -28,8 +28,8 @@ import cv2
 import numpy as np
 
 import gsmerge
-from gsmerge.geometry.transforms import quat_to_rotmat, rgb_to_sh0, rotmat_to_quat
-from gsmerge.raster.metrics import psnr, ssim
+from gsmerge.method.geometry.transforms import quat_to_rotmat, rgb_to_sh0, rotmat_to_quat
+from gsmerge.method.raster.metrics import psnr, ssim
 from gsmerge.scoring.lpips import INSTALL, lpips, lpips_available
 from gsmerge.types import Cameras, Gaussians
 

@@ -31,7 +31,7 @@ from captures import (
 from matplotlib.figure import Figure
 
 import gsmerge
-from gsmerge.facts.agreement import FEWEST, MOST_PER_PIXEL, WRONG_SHARE
+from gsmerge.method.facts.agreement import FEWEST, MOST_PER_PIXEL, WRONG_SHARE
 from gsmerge.research.charts.lines import mean_interval
 from gsmerge.scoring.evaluation_report import OUTSIDE_COLUMNS
 from gsmerge.scoring.fog import ALL

@@ -38,14 +38,14 @@ from typing import Any
 import numpy as np
 from captures import export_capture, make_parser, make_table, scene_folders
 
-from gsmerge.kernels import signature
-from gsmerge.kernels.build import compiler, find_platform
-from gsmerge.kernels.gaussians.optimise import adam
-from gsmerge.kernels.library import load_library
-from gsmerge.kernels.raster.binning import sort_bits
-from gsmerge.kernels.raster.blend import gather_slots
-from gsmerge.kernels.raster.project import project, project_backward
-from gsmerge.kernels.raster.step import PHASES, STEP
+from gsmerge.method.kernels import signature
+from gsmerge.method.kernels.build import compiler, find_platform
+from gsmerge.method.kernels.gaussians.optimise import adam
+from gsmerge.method.kernels.library import load_library
+from gsmerge.method.kernels.raster.binning import sort_bits
+from gsmerge.method.kernels.raster.blend import gather_slots
+from gsmerge.method.kernels.raster.project import project, project_backward
+from gsmerge.method.kernels.raster.step import PHASES, STEP
 
 HERE = Path(__file__).parent
 # Environment variables of a recorded run: the file of its record, and the library that counts pairs
@@ -162,7 +162,7 @@ class Machine:
 
 def compile_counter(target: str, folder: Path) -> Path:
     """Compile limit.c for a target of the kernels."""
-    platform, kernels = find_platform(), HERE.parent / "gsmerge" / "kernels"
+    platform, kernels = find_platform(), HERE.parent / "gsmerge" / "method" / "kernels"
     options = next(one for one in platform.targets if one.name == target)
     command, path = compiler(), folder / f"limit-{target}{platform.suffix}"
     is_zig = Path(command[0]).stem == "zig"

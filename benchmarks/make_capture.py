@@ -22,10 +22,10 @@ import cv2
 import numpy as np
 from captures import make_frame
 
-from gsmerge.geometry.transforms import project_points
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.cameras.read_cameras import find_cameras, read_cameras
 from gsmerge.io.image_names import natural_key
+from gsmerge.method.geometry.transforms import project_points
 
 SIDE, MULTIPLE = 480, 32  # longer side of photos, and the divisor of both sides, pixels
 SOURCES = 4  # most other views from which a view's depth is predicted

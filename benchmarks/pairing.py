@@ -43,7 +43,7 @@ from PIL import Image
 
 import gsmerge
 from gsmerge.io.bounds import read_json
-from gsmerge.kernels.pictures import turn_back
+from gsmerge.method.kernels.pictures import turn_back
 from gsmerge.reading.read_scene import load_scene
 
 TAGS = {0: 1, 2: 3, 3: 6, 1: 8}  # orientation tag of EXIF for each number of quarter turns

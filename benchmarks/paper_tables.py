@@ -22,9 +22,9 @@ import numpy as np
 from captures import Records, export_capture, make_parser, make_table, require_lpips, scene_folders
 
 import gsmerge
-from gsmerge.geometry.views import even_views, midpoint_views, pick_views, subset
-from gsmerge.networks.checkpoint import IN_PACKAGE
-from gsmerge.networks.options import SLOTS
+from gsmerge.method.geometry.views import even_views, midpoint_views, pick_views, subset
+from gsmerge.method.networks.checkpoint import IN_PACKAGE
+from gsmerge.method.networks.options import SLOTS
 from gsmerge.reading.checkpoint import load_checkpoint, save_checkpoint
 from gsmerge.reading.held_out import HeldOutViews, read_held_out
 from gsmerge.reading.read_scene import read_files

@@ -23,7 +23,7 @@ import numpy as np
 from captures import Targets, make_parser, parse_setting, read_held_out, scene_folders, write_export
 
 import gsmerge
-from gsmerge.raster.metrics import psnr
+from gsmerge.method.raster.metrics import psnr
 from gsmerge.types import Gaussians
 
 BAND = 0.3  # share of a photo's height

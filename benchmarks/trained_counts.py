@@ -22,7 +22,7 @@ from captures import CAPTURES, make_table, run_command
 import gsmerge
 from gsmerge.io import read_ply
 from gsmerge.io.formats.splat_transform import find_program
-from gsmerge.raster.metrics import psnr
+from gsmerge.method.raster.metrics import psnr
 from gsmerge.types import Cameras, Gaussians
 
 # Radii of the orbits in halves of the extent's diagonal, cameras on each orbit, and side of their pictures in pixels

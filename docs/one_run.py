@@ -27,8 +27,8 @@ import numpy as np
 from skimage.segmentation import find_boundaries
 
 import gsmerge
-from gsmerge.geometry.transforms import IDENTITY, covariances, project
-from gsmerge.pipelines.pixel_rows import PIXEL_ROWS
+from gsmerge.method.geometry.transforms import IDENTITY, covariances, project
+from gsmerge.method.pipelines.pixel_rows import PIXEL_ROWS
 from gsmerge.research.generate import GenerateOptions, NoiseOptions, generate_scene
 
 DOCS = Path(__file__).parent
@@ -43,7 +43,7 @@ DIAGONAL = ([0, 1, 2], [0, 1, 2])  # indices of the diagonal of a matrix [3,3]
 WATCHED = {  # functions that are recorded, by the module that calls them
     "gsmerge.reading.make_scene": ("find_pixels",),
     "gsmerge.run": ("make_plan", "build", "make_result"),
-    "gsmerge.pipelines.pixel_rows": ("segment_scene", "correct", "match", "merge", "decode_merged", "fit_scene"),
+    "gsmerge.method.pipelines.pixel_rows": ("segment_scene", "correct", "match", "merge", "decode_merged", "fit_scene"),
 }
 ZOOM, STRIP, GAP = 4, 22, 6  # enlargement of photos, height of a title, and gap between panels, pixels
 DARK, BORDER = 0.45, (255, 255, 255)  # brightness of the photo under ellipses, and RGB colour of superpixel borders

@@ -22,7 +22,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 import gsmerge
 from gsmerge.drawing.preview import to_picture
-from gsmerge.geometry.views import resize_cameras
+from gsmerge.method.geometry.views import resize_cameras
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "helpers")]

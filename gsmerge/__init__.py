@@ -32,8 +32,10 @@ if TYPE_CHECKING:
     from gsmerge.jobs.inspect import inspect as inspect
     from gsmerge.jobs.states.compactor import Compactor as Compactor
     from gsmerge.jobs.tensors import compact_tensors as compact_tensors
-    from gsmerge.raster import Rendering as Rendering
-    from gsmerge.raster import render as render
+    from gsmerge.method.raster import Rendering as Rendering
+    from gsmerge.method.raster import render as render
+    from gsmerge.method.stages.superpixels import saliency as saliency
+    from gsmerge.method.stages.superpixels import superpixels as superpixels
     from gsmerge.reading.held_out import read_held_out as read_held_out
     from gsmerge.reading.read_scene import load_scene as load_scene
     from gsmerge.reading.read_scene import read_scene as read_scene
@@ -44,8 +46,6 @@ if TYPE_CHECKING:
     from gsmerge.scoring.evaluate import evaluate as evaluate
     from gsmerge.settings.compact import CompactOptions as CompactOptions
     from gsmerge.settings.evaluate import EvaluateOptions as EvaluateOptions
-    from gsmerge.stages.superpixels import saliency as saliency
-    from gsmerge.stages.superpixels import superpixels as superpixels
     from gsmerge.types import Cameras as Cameras
     from gsmerge.types import Gaussians as Gaussians
     from gsmerge.types import Scene as Scene
@@ -64,12 +64,12 @@ _PUBLIC = {
     "scoring.evaluate": ("Evaluation", "evaluate"),
     "drawing.pages.view": ("view",),
     "jobs.states.compactor": ("Compactor",),
-    "raster": ("Rendering", "render"),
+    "method.raster": ("Rendering", "render"),
     "reading.held_out": ("read_held_out",),
     "reading.read_scene": ("load_scene", "read_scene"),
     "settings.compact": ("CompactOptions",),
     "settings.evaluate": ("EvaluateOptions",),
-    "stages.superpixels": ("saliency", "superpixels"),
+    "method.stages.superpixels": ("saliency", "superpixels"),
     "types": ("Cameras", "Gaussians", "Scene", "Views"),
 }
 _EXPORTS = {name: home for home, names in _PUBLIC.items() for name in names}

@@ -14,8 +14,8 @@ import numpy as np
 
 from gsmerge.arrays import Array, as_array, like
 from gsmerge.errors import SceneError
-from gsmerge.geometry.transforms import rotmat_to_quat
-from gsmerge.kernels.matrices import eigh, invert
+from gsmerge.method.geometry.transforms import rotmat_to_quat
+from gsmerge.method.kernels.matrices import eigh, invert
 
 
 def depth_anything_3(prediction: Any, *, sh_degree: int = 0) -> dict[str, Any]:

@@ -15,8 +15,8 @@ from __future__ import annotations
 from gsmerge.errors import GsmergeError as GsmergeError
 from gsmerge.errors import SceneError as SceneError
 from gsmerge.errors import UsageError as UsageError
-from gsmerge.facts.prepared import Prepared as Prepared
-from gsmerge.pipelines.plan import Plan as Plan
+from gsmerge.method.facts.prepared import Prepared as Prepared
+from gsmerge.method.pipelines.plan import Plan as Plan
 from gsmerge.plan.methods import Method as Method
 from gsmerge.prepare.prepare_scene import prepare as prepare
 from gsmerge.prepare.steps import without as without

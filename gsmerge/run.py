@@ -1,9 +1,9 @@
 """A run, from its first function to its last: read -> prepare -> plan -> build -> score -> write.
 
 :func:`compact_files` reads and writes, :func:`compact_scene` prepares and plans, and :func:`compact_prepared` builds
-and scores. A plain run goes through these functions from top to bottom. :func:`gsmerge.pipelines.build.build` calls
-the stages in their order. Every other run, such as a search for the number of Gaussians, is one call behind an ``if``;
-its module calls ``build`` as often as it needs.
+and scores. A plain run goes through these functions from top to bottom. :func:`gsmerge.method.pipelines.build.build`
+calls the stages in their order. Every other run, such as a search for the number of Gaussians, is one call behind an
+``if``; its module calls ``build`` as often as it needs.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 from gsmerge.errors import Doubt, DoubtWarning, SceneError, TargetError
-from gsmerge.facts.pictures import RENDERS
-from gsmerge.facts.prepared import Prepared
-from gsmerge.facts.scene_size import measure_size
 from gsmerge.io import atomic_outputs
 from gsmerge.io.formats.rows import result_comments
 from gsmerge.io.formats.table import Contents
 from gsmerge.io.formats.write import format_notes
-from gsmerge.pipelines.build import build, make_pipeline
-from gsmerge.pipelines.plan import Plan
+from gsmerge.method.facts.pictures import RENDERS
+from gsmerge.method.facts.prepared import Prepared
+from gsmerge.method.facts.scene_size import measure_size
+from gsmerge.method.pipelines.build import build, make_pipeline
+from gsmerge.method.pipelines.plan import Plan
 from gsmerge.plan.blocks import choose_blocks
 from gsmerge.plan.forecast import run_parts
 from gsmerge.plan.make_plan import is_without_views, make_plan, note_ignored

@@ -44,7 +44,7 @@ COMMANDS = {
     "video": tuple(f"render {{{x}}} -o {{out}}/a.mp4 --path orbit --frames 3 --overwrite" for x in "ab"),
 }
 # Modules that are imported once, before the commands are run in child processes
-MODULES = ("gsmerge.cli.app", "gsmerge.reading.input", "gsmerge.networks.apply", "gsmerge.jobs.states.files")
+MODULES = ("gsmerge.cli.app", "gsmerge.reading.input", "gsmerge.method.networks.apply", "gsmerge.jobs.states.files")
 OF_THE_RUN = ("seconds", "total_seconds", "peak_memory_bytes")  # keys of reports that differ from run to run
 RECORDS, LOCK = "batch.jsonl", ".gsmerge-lock"  # records of a batch, and the file that exists while a folder is in use
 # Faults on purpose, to show that they are reported: functions that replace those of ``os``

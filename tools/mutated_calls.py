@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gsmerge.kernels import signature
-from gsmerge.kernels.build import FOLDER
+from gsmerge.method.kernels import signature
+from gsmerge.method.kernels.build import FOLDER
 
 CALLS, CHANGES = 8, 60  # number of calls of each function that are repeated, and number of repeats
 BYTES = 1 << 22  # calls with arrays of more bytes are not repeated
@@ -159,4 +159,4 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
 signature.declare = declare
 for _path in sorted(FOLDER.rglob("*.py")):
     if _path.name != "build.py":  # others import it as they need it
-        import_module(".".join(("gsmerge.kernels", *_path.relative_to(FOLDER).with_suffix("").parts)))
+        import_module(".".join(("gsmerge.method.kernels", *_path.relative_to(FOLDER).with_suffix("").parts)))

@@ -20,7 +20,7 @@ import gsmerge
 from gsmerge import errors, integrations
 from gsmerge.cli.app import app
 from gsmerge.io.formats import gsm
-from gsmerge.networks import checkpoint
+from gsmerge.method.networks import checkpoint
 from gsmerge.runtime import documents
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.evaluate import EvaluateOptions

@@ -23,7 +23,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
-from gsmerge.kernels import build  # noqa: E402
+from gsmerge.method.kernels import build  # noqa: E402
 
 KERNELS = ("-p", "mutated_calls", "tests/kernels", "--ignore=tests/kernels/test_build.py")
 COMMANDS = ("tests/e2e/test_every_command.py", "tests/e2e/test_damaged_files.py")

@@ -22,18 +22,20 @@ from gsmerge.blocks.partition import (
 from gsmerge.blocks.start_block import BlockStart, start_block
 from gsmerge.counts.file_size import drop_to_bytes, measure_least_bytes
 from gsmerge.errors import Doubt
-from gsmerge.facts.pictures import OWN_PHOTOS, PHOTOS
-from gsmerge.facts.scene_size import SceneSize
-from gsmerge.fit import fit_scene, peak_weights
-from gsmerge.geometry.frame import Frame, scene_frame
-from gsmerge.geometry.views import subset
-from gsmerge.pipelines.plan import Plan
+from gsmerge.method.facts.pictures import OWN_PHOTOS, PHOTOS
+from gsmerge.method.facts.scene_size import SceneSize
+from gsmerge.method.fit import fit_scene, peak_weights
+from gsmerge.method.geometry.frame import Frame, scene_frame
+from gsmerge.method.geometry.views import subset
+from gsmerge.method.pipelines.plan import Plan
+from gsmerge.method.raster.metrics import SAMPLE_LOSS, describe_loss, is_worse
+from gsmerge.method.raster.photos import blank_photos
+from gsmerge.method.stages.clean import faintest_dropped
+from gsmerge.method.stages.prune import split_unseen
 from gsmerge.plan.blocks import WHOLE_GAUSSIANS
 from gsmerge.plan.counts import file_size
 from gsmerge.plan.forecast import INPUT_STEPS, STAGE_STEPS
 from gsmerge.plan.make_plan import plan_scene
-from gsmerge.raster.metrics import SAMPLE_LOSS, describe_loss, is_worse
-from gsmerge.raster.photos import blank_photos
 from gsmerge.results.report import CompactReport
 from gsmerge.results.result import CompactResult
 from gsmerge.results.scores import measure_result
@@ -54,8 +56,6 @@ from gsmerge.scoring.evaluate import evaluate
 from gsmerge.settings.budget import AUTO, parse_share, share_text
 from gsmerge.settings.compact import ONE_PIECE, CompactOptions
 from gsmerge.settings.evaluate import EvaluateOptions
-from gsmerge.stages.clean import faintest_dropped
-from gsmerge.stages.prune import split_unseen
 from gsmerge.types import Cameras, Decoded, Gaussians, Scene
 
 T = TypeVar("T")

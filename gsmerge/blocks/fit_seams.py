@@ -8,12 +8,12 @@ from dataclasses import fields, replace
 import numpy as np
 
 from gsmerge.blocks.start_block import BlockStart
-from gsmerge.fit import fit_scene, peak_weights
-from gsmerge.geometry.views import in_float64, subset
-from gsmerge.raster import make_splats, tile_view
-from gsmerge.raster.composite import list_contributions
-from gsmerge.raster.photos import Photos, blank_photos
-from gsmerge.raster.tiled_view import Splats
+from gsmerge.method.fit import fit_scene, peak_weights
+from gsmerge.method.geometry.views import in_float64, subset
+from gsmerge.method.raster import make_splats, tile_view
+from gsmerge.method.raster.composite import list_contributions
+from gsmerge.method.raster.photos import Photos, blank_photos
+from gsmerge.method.raster.tiled_view import Splats
 from gsmerge.reading.alignment.registration.join import concat_scenes, concat_values
 from gsmerge.runtime.memory import free_pages, make_array
 from gsmerge.runtime.record import add_seconds, begin_part, record_choices, record_part, stage

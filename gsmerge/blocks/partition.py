@@ -12,8 +12,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from gsmerge.frozen import dataclass, field
-from gsmerge.geometry.transforms import camera_centres, project
-from gsmerge.kernels.reproject import see_points
+from gsmerge.method.geometry.transforms import camera_centres, project
+from gsmerge.method.kernels.reproject import see_points
 from gsmerge.runtime.memory import free_pages
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Scene

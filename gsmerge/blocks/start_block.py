@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from gsmerge.blocks.partition import Block, Covisibility, owning_views
-from gsmerge.facts.prepared import Prepared
 from gsmerge.frozen import dataclass, replace
-from gsmerge.geometry.frame import Frame
-from gsmerge.pipelines.pixel_rows import merge_views
-from gsmerge.pipelines.plan import Plan
+from gsmerge.method.facts.prepared import Prepared
+from gsmerge.method.geometry.frame import Frame
+from gsmerge.method.pipelines.pixel_rows import merge_views
+from gsmerge.method.pipelines.plan import Plan
 from gsmerge.plan.make_plan import make_plan
 from gsmerge.prepare.prepare_scene import prepare
 from gsmerge.results.scores import measure_input

@@ -173,8 +173,8 @@ class Totals:
 
     def add(self, record: Mapping[str, Any]) -> None:
         """Add the record of one scene to the totals."""
-        from gsmerge.facts.pictures import ROW_COLORS
-        from gsmerge.raster.metrics import MAX_PSNR, psnr_figure
+        from gsmerge.method.facts.pictures import ROW_COLORS
+        from gsmerge.method.raster.metrics import MAX_PSNR, psnr_figure
         from gsmerge.runtime.memory import human_share
 
         report = record["report"]

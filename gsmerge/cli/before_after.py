@@ -69,10 +69,10 @@ def read_before_after(
     ``files`` are the files of the scene, which may be ``loaded`` already. If it has no views, some views are placed.
     """
     from gsmerge.io import read_gaussians
+    from gsmerge.method.viewpoints.place_cameras import NO_VIEWS, PLACED_VIEWS, add_views
     from gsmerge.reading.read_scene import read_files
     from gsmerge.reading.scene_files import result_cameras
     from gsmerge.runtime.record import record_run
-    from gsmerge.viewpoints.place_cameras import NO_VIEWS, PLACED_VIEWS, add_views
 
     if files.cameras is None and "cameras" not in files.named:  # a result may have cameras although its scene has none
         files = replace(files, cameras=next(filter(None, map(result_cameras, after)), None))
@@ -103,9 +103,9 @@ def own_cameras(paths: Sequence[Path], scene: Scene) -> tuple[dict[str, Cameras]
     """
     import numpy as np
 
-    from gsmerge.geometry.frame import scene_depth
     from gsmerge.io.cameras.camera_file import describe_moves, list_moves
     from gsmerge.io.cameras.read_cameras import read_cameras
+    from gsmerge.method.geometry.frame import scene_depth
     from gsmerge.reading.scene_files import result_cameras
 
     cameras: dict[str, Cameras] = {}
@@ -144,7 +144,7 @@ def held_out_views(
 
     With ``views``, only the held-out views between the chosen views are returned.
     """
-    from gsmerge.geometry.views import even_views, midpoint_views, subset
+    from gsmerge.method.geometry.views import even_views, midpoint_views, subset
     from gsmerge.reading.held_out import read_held_out
 
     if target_images is not None and targets is None:

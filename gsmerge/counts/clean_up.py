@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-from gsmerge.facts.prepared import Prepared
-from gsmerge.fit import Fitted
-from gsmerge.pipelines.build import build
-from gsmerge.pipelines.plan import Plan
+from gsmerge.method.facts.prepared import Prepared
+from gsmerge.method.fit import Fitted
+from gsmerge.method.pipelines.build import build
+from gsmerge.method.pipelines.plan import Plan
+from gsmerge.method.stages.clean import clean, describe_counts, faintest_dropped
 from gsmerge.results.candidate import Candidate, score
 from gsmerge.runtime.record import Record, add_seconds, adopt, begin_part, note, record_choices, record_part
-from gsmerge.stages.clean import clean, describe_counts, faintest_dropped
 from gsmerge.types import Gaussians
 
 SURPLUS = 1.05  # Gaussians that are built, relative to the number that has to remain after clean-up

@@ -13,14 +13,14 @@ from itertools import pairwise
 
 import numpy as np
 
-from gsmerge.facts.prepared import Prepared
-from gsmerge.fit.photo_sizes import holdout_psnr, training_weights
 from gsmerge.frozen import dataclass, replace
-from gsmerge.kernels.elementary import log, power
-from gsmerge.pipelines.build import build
-from gsmerge.pipelines.plan import Plan
-from gsmerge.raster.metrics import WINDOW, ssim
-from gsmerge.raster.photos import Photos, render_photos, scene_photos
+from gsmerge.method.facts.prepared import Prepared
+from gsmerge.method.fit.photo_sizes import holdout_psnr, training_weights
+from gsmerge.method.kernels.elementary import log, power
+from gsmerge.method.pipelines.build import build
+from gsmerge.method.pipelines.plan import Plan
+from gsmerge.method.raster.metrics import WINDOW, ssim
+from gsmerge.method.raster.photos import Photos, render_photos, scene_photos
 from gsmerge.results.left_out import LEAST_SEEN, LeftOut
 from gsmerge.runtime.record import begin_part, record_part, report_progress
 from gsmerge.runtime.threads import parallel_map

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 
 from gsmerge.counts.clean_up import build_candidate
 from gsmerge.errors import UsageError
-from gsmerge.facts.prepared import Prepared
-from gsmerge.pipelines.plan import FileSize, Plan
+from gsmerge.method.facts.prepared import Prepared
+from gsmerge.method.pipelines.plan import FileSize, Plan
+from gsmerge.method.stages.clean import faintest_dropped
 from gsmerge.results.candidate import Candidate, rescore
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.record import add_seconds
-from gsmerge.stages.clean import faintest_dropped
 from gsmerge.types import Cameras, Gaussians
 
 BUILD_SURPLUS = 1.02  # Gaussians of a build, relative to the number that seems to fit

@@ -9,11 +9,12 @@ from typing import Any
 from gsmerge.counts.clean_up import build_candidate, clean_fitted, record_dropped
 from gsmerge.counts.curve import count_reaching, count_within, curve_counts, curve_knee, measure_curve
 from gsmerge.counts.file_size import meet_bytes
-from gsmerge.facts.pictures import PHOTOS, RENDERS
-from gsmerge.facts.prepared import LEAST_VIEWS, Prepared
-from gsmerge.kernels.elementary import exp, log, power
-from gsmerge.pipelines.build import build
-from gsmerge.pipelines.plan import CountPlan, Plan
+from gsmerge.method.facts.pictures import PHOTOS, RENDERS
+from gsmerge.method.facts.prepared import LEAST_VIEWS, Prepared
+from gsmerge.method.kernels.elementary import exp, log, power
+from gsmerge.method.pipelines.build import build
+from gsmerge.method.pipelines.plan import CountPlan, Plan
+from gsmerge.method.stages.segment import knee_count
 from gsmerge.plan.counts import FIDELITY_LOSS, level_counts
 from gsmerge.plan.forecast import STAGE_STEPS, run_parts
 from gsmerge.results.candidate import Candidate, score
@@ -32,7 +33,6 @@ from gsmerge.runtime.record import (
     stage,
 )
 from gsmerge.settings.stages import CleanOptions
-from gsmerge.stages.segment import knee_count
 
 # The slope is the gain of PSNR (dB) per doubling of the count. Until two counts were built, a search assumes these
 # slopes, against photos and against renders of the input. Photos that were left out gained LEFT_OUT_SLOPE below the

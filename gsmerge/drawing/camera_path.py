@@ -10,7 +10,8 @@ import re
 import numpy as np
 
 from gsmerge.frozen import dataclass, replace
-from gsmerge.geometry.transforms import (
+from gsmerge.io.cameras.viewer_cameras import order_views
+from gsmerge.method.geometry.transforms import (
     camera_centres,
     lower_median,
     middle_depth,
@@ -19,9 +20,8 @@ from gsmerge.geometry.transforms import (
     rotmat_to_quat,
     step_outside,
 )
-from gsmerge.io.cameras.viewer_cameras import order_views
-from gsmerge.kernels.elementary import arctan2, cos, sin
-from gsmerge.kernels.matrices import matmul
+from gsmerge.method.kernels.elementary import arctan2, cos, sin
+from gsmerge.method.kernels.matrices import matmul
 from gsmerge.scoring.fog import FOG_CAMERAS
 from gsmerge.types import Cameras
 

@@ -22,7 +22,7 @@ from gsmerge.errors import SceneError
 from gsmerge.frozen import dataclass
 from gsmerge.io import atomic_output
 from gsmerge.io.image_names import CLIP_ENDS
-from gsmerge.kernels.elementary import sin
+from gsmerge.method.kernels.elementary import sin
 from gsmerge.settings.files import GIF
 from gsmerge.types import StrPath
 

@@ -14,9 +14,9 @@ from gsmerge.drawing.camera_path import outside_camera
 from gsmerge.errors import SceneError
 from gsmerge.io import atomic_output
 from gsmerge.io.photo_files import mark_drawn
-from gsmerge.raster import render
-from gsmerge.raster.metrics import psnr, psnr_words
-from gsmerge.raster.photos import COVERED_TRANSMITTANCE, WHOLE_SHARE
+from gsmerge.method.raster import render
+from gsmerge.method.raster.metrics import psnr, psnr_words
+from gsmerge.method.raster.photos import COVERED_TRANSMITTANCE, WHOLE_SHARE
 from gsmerge.types import Cameras, Gaussians
 
 BytePicture = NDArray[np.uint8]  # [h,w,3], sRGB

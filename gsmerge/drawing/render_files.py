@@ -32,16 +32,17 @@ from gsmerge.drawing.preview import (
 )
 from gsmerge.errors import SceneError, UsageError, name_notes
 from gsmerge.frozen import dataclass, replace
-from gsmerge.geometry.views import pick_views, subset
 from gsmerge.io import file_notes, read_cameras, read_gaussians, to_cameras
 from gsmerge.io.atomic import atomic_outputs, common_mode
 from gsmerge.io.cameras.camera_file import sizes_of
 from gsmerge.io.cameras.read_cameras import read_sharp_camera
 from gsmerge.io.formats.read_gaussians import FileInfo
 from gsmerge.io.image_names import IMAGE_SUFFIXES
+from gsmerge.method.geometry.views import pick_views, subset
+from gsmerge.method.raster import render_in_batches
+from gsmerge.method.raster.photos import NEAR_PLANE
+from gsmerge.method.viewpoints.place_cameras import add_views
 from gsmerge.prepare.prepare_scene import scored_pictures
-from gsmerge.raster import render_in_batches
-from gsmerge.raster.photos import NEAR_PLANE
 from gsmerge.reading.exporters import NO_HINTS, ReadHints
 from gsmerge.reading.held_out import read_into_frame
 from gsmerge.reading.read_scene import Loaded, move_cameras_to_scene, read_gaussian_file
@@ -53,7 +54,6 @@ from gsmerge.scoring.sizes import fill_cameras, fill_photo, shrink_cameras
 from gsmerge.settings.files import CLIPS, GIF, PICTURES, TRANSPARENT
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.types import Cameras, Gaussians, StrPath
-from gsmerge.viewpoints.place_cameras import add_views
 
 SECONDS = 4  # least duration of a clip
 VIEW_FRAMES = 4  # least number of frames for each view of a spline

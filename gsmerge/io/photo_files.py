@@ -20,8 +20,8 @@ from gsmerge.frozen import dataclass, replace
 from gsmerge.io.bounds import MAX_PIXELS, ReadBudget, check_file, check_image_size, read_errors
 from gsmerge.io.first_bytes import refuse_picture
 from gsmerge.io.image_names import ImageSource, match_images
-from gsmerge.kernels.matrices import matmul
-from gsmerge.kernels.pictures import turn_picture
+from gsmerge.method.kernels.matrices import matmul
+from gsmerge.method.kernels.pictures import turn_picture
 from gsmerge.runtime.memory import free_pages, make_array
 from gsmerge.runtime.threads import parallel_map, quiet_warnings
 from gsmerge.types import Cameras

@@ -11,8 +11,6 @@ import numpy as np
 
 from gsmerge.errors import Doubt, SceneError, UsageError, name_notes
 from gsmerge.frozen import dataclass, field, replace
-from gsmerge.geometry.frame import scene_frame
-from gsmerge.geometry.transforms import IDENTITY, Similarity, euler_to_rotmat, normalize
 from gsmerge.io import GaussianFile, file_notes, read_cameras, read_gaussians
 from gsmerge.io.cameras.camera_file import CameraFile, to_cameras
 from gsmerge.io.cameras.viewer_cameras import viewer_cameras_path
@@ -22,7 +20,12 @@ from gsmerge.io.formats.rows import RESULT_COMMENT, result_comments, states_vert
 from gsmerge.io.formats.table import Contents, Format
 from gsmerge.io.formats.write import format_notes
 from gsmerge.io.photo_files import read_images
-from gsmerge.kernels.matrices import matmul
+from gsmerge.method.geometry.frame import scene_frame
+from gsmerge.method.geometry.transforms import IDENTITY, Similarity, euler_to_rotmat, normalize
+from gsmerge.method.kernels.matrices import matmul
+from gsmerge.method.stages.clean import clean, describe_counts
+from gsmerge.method.stages.pair_merge import merge_neighbors
+from gsmerge.method.viewpoints.place_cameras import place_viewpoints
 from gsmerge.plan.counts import STREAMED_LEVELS, level_counts
 from gsmerge.reading.scene_files import find_scene_files, named_path, result_cameras, scene_title
 from gsmerge.results.outputs import NUM_FULL, Outputs, frame_notes, join_gaussians, pad_harmonics, write_outputs
@@ -33,10 +36,7 @@ from gsmerge.runtime.threads import use_threads
 from gsmerge.settings.files import AXES, PlacementOptions, parse_triple
 from gsmerge.settings.reading import NONE, ColorChoice, OpacityChoice, ScaleChoice
 from gsmerge.settings.stages import CleanOptions
-from gsmerge.stages.clean import clean, describe_counts
-from gsmerge.stages.pair_merge import merge_neighbors
 from gsmerge.types import NO_CAMERAS, Cameras, Gaussians, StrPath, make_scene
-from gsmerge.viewpoints.place_cameras import place_viewpoints
 
 
 @dataclass(frozen=True)

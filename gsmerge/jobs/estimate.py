@@ -11,12 +11,12 @@ import numpy as np
 from gsmerge.blocks.partition import gaussians_at_once
 from gsmerge.counts.curve import curve_counts
 from gsmerge.errors import count_words
-from gsmerge.facts.scene_size import measure_size
 from gsmerge.frozen import dataclass
-from gsmerge.geometry.frame import canonicalise
 from gsmerge.io.formats.ply import file_bytes
 from gsmerge.io.formats.table import find_format
-from gsmerge.pipelines.bare_rows import BARE_ROWS
+from gsmerge.method.facts.scene_size import measure_size
+from gsmerge.method.geometry.frame import canonicalise
+from gsmerge.method.pipelines.bare_rows import BARE_ROWS
 from gsmerge.plan.blocks import choose_blocks
 from gsmerge.plan.counts import FIDELITY_LOSS, FIDELITY_PSNR, level_counts, resolve_budget
 from gsmerge.plan.forecast import TRIAL_SHARE, usual_builds

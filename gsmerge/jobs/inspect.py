@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from gsmerge.errors import Doubt, SceneError, attempt
-from gsmerge.facts.scene_size import unlike_captures
 from gsmerge.io import GaussianFile, file_notes, kept_comments
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.formats.gsm import list_batches
@@ -18,12 +17,15 @@ from gsmerge.io.formats.read_gaussians import degree_notes
 from gsmerge.io.formats.rows import read_expected_scores
 from gsmerge.io.photo_files import photo_array
 from gsmerge.jobs.estimate import estimate, estimate_lines
+from gsmerge.method.facts.scene_size import unlike_captures
+from gsmerge.method.raster.photos import LEAST_OPACITY
+from gsmerge.method.stages.sky import sky_regions
+from gsmerge.method.viewpoints.support import count_views_in_world
 from gsmerge.plan.counts import describe_share
 from gsmerge.prepare.confirm_depths import confirm_depths
 from gsmerge.prepare.prepare_scene import views_notes
 from gsmerge.prepare.repeats import without_repeats
 from gsmerge.prepare.steps import begin, select, take_steps
-from gsmerge.raster.photos import LEAST_OPACITY
 from gsmerge.reading.alignment import check_cameras
 from gsmerge.reading.candidates import read_scene_cameras
 from gsmerge.reading.choice import candidate_lines
@@ -39,9 +41,7 @@ from gsmerge.scoring.coverage import coverage, extents
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.reading import OpacityChoice
 from gsmerge.settings.setting import join_words
-from gsmerge.stages.sky import sky_regions
 from gsmerge.types import StrPath
-from gsmerge.viewpoints.support import count_views_in_world
 
 _OWN = "gsmerge"  # exporter of files that gsmerge wrote
 _FILE_KEYS = (

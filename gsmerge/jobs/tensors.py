@@ -10,7 +10,6 @@ import numpy as np
 
 from gsmerge.arrays import Array, as_array, to_float32
 from gsmerge.errors import SceneError, count_words
-from gsmerge.geometry.transforms import normalize, rgb_to_sh0
 from gsmerge.io.bounds import check_image_size
 from gsmerge.io.cameras.camera_file import (
     C2W_OPENCV,
@@ -23,6 +22,7 @@ from gsmerge.io.cameras.camera_file import (
 )
 from gsmerge.io.formats.read_gaussians import clear_invalid, clear_rows, find_empty
 from gsmerge.io.photo_files import photo_array
+from gsmerge.method.geometry.transforms import normalize, rgb_to_sh0
 from gsmerge.reading.alignment import (
     check_pairs,
     choose_poses,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from gsmerge.errors import UsageError
-from gsmerge.facts.scene_size import SceneSize
+from gsmerge.method.facts.scene_size import SceneSize
 from gsmerge.settings.compact import CompactOptions
 
 BLOCK_GAUSSIANS = 8_000_000  # Gaussians of a block's own views, if the number of blocks is automatic

@@ -5,17 +5,17 @@ from __future__ import annotations
 from functools import partial
 
 from gsmerge.errors import UsageError
-from gsmerge.facts.agreement import FEWEST, Agreement
-from gsmerge.facts.scene_size import SceneSize
 from gsmerge.frozen import replace
 from gsmerge.io.formats.measure import measure_bytes
 from gsmerge.io.formats.table import PLY, Format, count_for_bytes, output_format
-from gsmerge.pipelines.plan import FileSize
+from gsmerge.method.facts.agreement import FEWEST, Agreement
+from gsmerge.method.facts.scene_size import SceneSize
+from gsmerge.method.pipelines.plan import FileSize
+from gsmerge.method.stages.limits import CountLimits, count_for
 from gsmerge.runtime.record import note
 from gsmerge.settings.budget import AUTO, DEVICES, BudgetOptions, parse_budget, parse_bytes
 from gsmerge.settings.compact import OURS, CompactOptions
 from gsmerge.settings.stages import SHARE, DecodeOptions, SegmentOptions
-from gsmerge.stages.limits import CountLimits, count_for
 
 # If a scene has neither photos nor pixels, its result has by default at least this PSNR (dB) against the input
 FIDELITY_PSNR = 32.5

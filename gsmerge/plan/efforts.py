@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from gsmerge.frozen import dataclass
-from gsmerge.geometry.views import REPORT_VIEWS
+from gsmerge.method.geometry.views import REPORT_VIEWS
 from gsmerge.settings.fit import STEPS
 
 

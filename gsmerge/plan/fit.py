@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import math
 
-from gsmerge.facts.prepared import Prepared
-from gsmerge.facts.scene_size import SceneSize
-from gsmerge.fit import photo_scale
 from gsmerge.frozen import replace
+from gsmerge.method.facts.prepared import Prepared
+from gsmerge.method.facts.scene_size import SceneSize
+from gsmerge.method.fit import photo_scale
+from gsmerge.method.stages.limits import CountLimits
 from gsmerge.plan.efforts import EFFORTS
 from gsmerge.runtime.record import note
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.fit import GROW_ROUNDS, GROW_STEPS, USUAL_SHARE, FitOptions
-from gsmerge.stages.limits import CountLimits
 
 AUTO_STEPS = 2  # with budget auto, steps relative to the usual number: few Gaussians need more steps
 SHORT_STEPS = 60  # a fit with at most this many steps still gains from a better start

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from gsmerge.facts.pictures import RENDERS
-from gsmerge.facts.prepared import Prepared
-from gsmerge.pipelines.plan import Plan
+from gsmerge.method.facts.pictures import RENDERS
+from gsmerge.method.facts.prepared import Prepared
+from gsmerge.method.pipelines.plan import Plan
 from gsmerge.runtime.record import RunPart
 
 # Number of candidates that a search usually builds: first, if photos score them; second, if renders of the input do

@@ -9,15 +9,18 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from gsmerge.errors import UsageError
-from gsmerge.facts.pictures import RENDERS
-from gsmerge.facts.prepared import Prepared
-from gsmerge.facts.scene_size import SceneSize
-from gsmerge.fit import start_share
 from gsmerge.frozen import replace
-from gsmerge.geometry.views import pick_views, scored_views
-from gsmerge.pipelines.bare_rows import BARE_ROWS
-from gsmerge.pipelines.pixel_rows import PIXEL_ROWS
-from gsmerge.pipelines.plan import CountPlan, MergePlan, Pipeline, Plan, ScorePlan
+from gsmerge.method.facts.pictures import RENDERS
+from gsmerge.method.facts.prepared import Prepared
+from gsmerge.method.facts.scene_size import SceneSize
+from gsmerge.method.fit import start_share
+from gsmerge.method.geometry.views import pick_views, scored_views
+from gsmerge.method.pipelines.bare_rows import BARE_ROWS
+from gsmerge.method.pipelines.pixel_rows import PIXEL_ROWS
+from gsmerge.method.pipelines.plan import CountPlan, MergePlan, Pipeline, Plan, ScorePlan
+from gsmerge.method.raster.photos import scored_tiles
+from gsmerge.method.stages.fit_pairs import choose_power
+from gsmerge.method.stages.segment import SharedTree, SuperpixelChoices
 from gsmerge.plan.counts import (
     FIDELITY_PSNR,
     count_limits,
@@ -30,19 +33,16 @@ from gsmerge.plan.counts import (
 from gsmerge.plan.efforts import EFFORTS
 from gsmerge.plan.fit import SHORT_STEPS, fit_to_pictures, resolve_fit
 from gsmerge.plan.networks import choose_networks, cuts_views, load_networks
-from gsmerge.raster.photos import scored_tiles
 from gsmerge.runtime.record import note, stage
 from gsmerge.settings.budget import AUTO
 from gsmerge.settings.compact import COUNTS, OURS, CompactOptions
 from gsmerge.settings.fit import FitOptions
 from gsmerge.settings.setting import flat_settings
 from gsmerge.settings.stages import SHARE, USUAL_K, DecodeOptions, MatchOptions, PrepareOptions, SegmentOptions
-from gsmerge.stages.fit_pairs import choose_power
-from gsmerge.stages.segment import SharedTree, SuperpixelChoices
 from gsmerge.types import Scene
 
 if TYPE_CHECKING:
-    from gsmerge.networks.checkpoint import Checkpoint
+    from gsmerge.method.networks.checkpoint import Checkpoint
 
 
 LONE_K = 4  # K if all views have the same camera, because no other view adds Gaussians to a surface

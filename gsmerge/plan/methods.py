@@ -8,9 +8,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from gsmerge.errors import UsageError
-from gsmerge.facts.prepared import Prepared
 from gsmerge.frozen import dataclass
-from gsmerge.pipelines.plan import Plan
+from gsmerge.method.facts.prepared import Prepared
+from gsmerge.method.pipelines.plan import Plan
 from gsmerge.prepare.prepare_scene import prepare
 from gsmerge.runtime.plugins import METHODS, load_plugin
 from gsmerge.runtime.record import note

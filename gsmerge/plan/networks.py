@@ -5,14 +5,14 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from gsmerge.errors import UsageError
-from gsmerge.facts.scene_size import SceneSize
 from gsmerge.frozen import replace
+from gsmerge.method.facts.scene_size import SceneSize
 from gsmerge.plan.efforts import EFFORTS
 from gsmerge.runtime.record import note
 from gsmerge.settings.compact import CHECKPOINTS, OURS, CompactOptions
 
 if TYPE_CHECKING:
-    from gsmerge.networks.checkpoint import Checkpoint
+    from gsmerge.method.networks.checkpoint import Checkpoint
 
 
 def cuts_views(options: CompactOptions, size: SceneSize) -> bool:

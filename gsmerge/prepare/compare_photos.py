@@ -13,8 +13,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsmerge.compare.assign_photos import Assigner, Candidates
-from gsmerge.compare.colors import (
+from gsmerge.errors import Doubt
+from gsmerge.method.compare.assign_photos import Assigner, Candidates
+from gsmerge.method.compare.colors import (
     EXPOSURE_STEP,
     VISIBLE,
     cut_blocks,
@@ -29,17 +30,23 @@ from gsmerge.compare.colors import (
     tone_blocks,
     vary_in_hue,
 )
-from gsmerge.compare.similarity import stands_out
-from gsmerge.compare.view_pictures import PICTURE_PIXELS, Pairs, ViewPictures, draw_canonical, pair_photos, show_views
-from gsmerge.errors import Doubt
-from gsmerge.geometry.gaps import fill_gaps
-from gsmerge.geometry.transforms import sh0_to_rgb
-from gsmerge.geometry.views import camera_kinds
-from gsmerge.kernels.pictures import convolve
+from gsmerge.method.compare.similarity import stands_out
+from gsmerge.method.compare.view_pictures import (
+    PICTURE_PIXELS,
+    Pairs,
+    ViewPictures,
+    draw_canonical,
+    pair_photos,
+    show_views,
+)
+from gsmerge.method.geometry.gaps import fill_gaps
+from gsmerge.method.geometry.transforms import sh0_to_rgb
+from gsmerge.method.geometry.views import camera_kinds
+from gsmerge.method.kernels.pictures import convolve
+from gsmerge.method.raster import render
+from gsmerge.method.raster.photos import counting_pixels, row_pictures
 from gsmerge.prepare.photo_change import PhotoChange, change_large
 from gsmerge.prepare.row_colors import RowPicture, picture_rows
-from gsmerge.raster import render
-from gsmerge.raster.photos import counting_pixels, row_pictures
 from gsmerge.runtime.record import list_some, note, record_choices
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.stages import Look
@@ -200,7 +207,7 @@ def _group_by_curve(pairs: Pairs, views: Sequence[int]) -> list[list[int]]:
 def find_matching_views(
     scene: PicturedScene, views: Sequence[int], photos: Sequence[np.ndarray], shown: ViewPictures
 ) -> list[int]:
-    """Find which of ``views`` are shown by their ``photos [h,w,3]``; see :mod:`gsmerge.compare.assign_photos`.
+    """Find which of ``views`` are shown by their ``photos [h,w,3]``; see :mod:`gsmerge.method.compare.assign_photos`.
 
     No view is returned if all photos together match their views no better than photos match other views. Views of one
     camera share one photo. ``shown`` are small pictures of the Gaussians in all views, which are reused if they are

@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsmerge.facts.agreement import CONFIRM_PIXELS, Agreement
-from gsmerge.geometry.frame import scene_depth
-from gsmerge.geometry.transforms import camera_depths, nearest_views, project
-from gsmerge.kernels.elementary import log
+from gsmerge.method.facts.agreement import CONFIRM_PIXELS, Agreement
+from gsmerge.method.geometry.frame import scene_depth
+from gsmerge.method.geometry.transforms import camera_depths, nearest_views, project
+from gsmerge.method.kernels.elementary import log
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Scene
 

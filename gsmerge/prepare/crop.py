@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 
 from gsmerge.errors import UsageError
-from gsmerge.geometry.frame import canonicalise
-from gsmerge.geometry.regions import find_region
-from gsmerge.geometry.transforms import lies_inside, rgb_to_sh0
-from gsmerge.geometry.views import take_rows
+from gsmerge.method.geometry.frame import canonicalise
+from gsmerge.method.geometry.regions import find_region
+from gsmerge.method.geometry.transforms import lies_inside, rgb_to_sh0
+from gsmerge.method.geometry.views import take_rows
+from gsmerge.method.raster import render_in_batches
 from gsmerge.prepare.fill_holes import usual_opacity
-from gsmerge.raster import render_in_batches
 from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import use_threads
 from gsmerge.types import Scene

@@ -11,10 +11,10 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
+from gsmerge.method.raster import render
+from gsmerge.method.raster.photos import COVERED_TRANSMITTANCE, counting_pixels
 from gsmerge.prepare.fill_holes import find_bare, large_parts
 from gsmerge.prepare.photo_change import PhotoChange, change_large
-from gsmerge.raster import render
-from gsmerge.raster.photos import COVERED_TRANSMITTANCE, counting_pixels
 from gsmerge.runtime.record import note
 from gsmerge.types import PicturedScene
 

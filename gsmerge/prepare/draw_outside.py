@@ -11,18 +11,18 @@ from dataclasses import replace
 import numpy as np
 
 from gsmerge.errors import count_words
-from gsmerge.fit.outside import outside_cameras
-from gsmerge.geometry.transforms import motion_matrices
-from gsmerge.geometry.views import concat_cameras, even_views, resize_cameras
-from gsmerge.kernels.elementary import arctan2
-from gsmerge.kernels.matrices import matmul
+from gsmerge.method.fit.outside import outside_cameras
+from gsmerge.method.geometry.transforms import motion_matrices
+from gsmerge.method.geometry.views import concat_cameras, even_views, resize_cameras
+from gsmerge.method.kernels.elementary import arctan2
+from gsmerge.method.kernels.matrices import matmul
+from gsmerge.method.raster import render
+from gsmerge.method.raster.images import thin_out
+from gsmerge.method.raster.photos import NEAR_PLANE, blank_photos, counting_pixels, photo_errors
+from gsmerge.method.viewpoints.place_cameras import CANDIDATE_GAUSSIANS, PROBE, choose_candidates
 from gsmerge.prepare.true_pixels import find_pixels
-from gsmerge.raster import render
-from gsmerge.raster.images import thin_out
-from gsmerge.raster.photos import NEAR_PLANE, blank_photos, counting_pixels, photo_errors
 from gsmerge.runtime.record import note, record_choices
 from gsmerge.types import Cameras, Gaussians, PicturedScene, Pixels, make_scene
-from gsmerge.viewpoints.place_cameras import CANDIDATE_GAUSSIANS, PROBE, choose_candidates
 
 # Cameras are placed if views miss at least this share of the Gaussians. A placed camera is used if at least this share
 # of its pixels shows mainly Gaussians that the views miss. In fifteen captures in voxels, at most .001 of the Gaussians

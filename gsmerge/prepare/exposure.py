@@ -19,12 +19,19 @@ from collections.abc import Sequence
 import numpy as np
 
 from gsmerge.frozen import dataclass, replace
-from gsmerge.geometry.transforms import camera_distances, correlation, medians, order_others, rgb_to_sh0, sh0_to_rgb
-from gsmerge.kernels.elementary import exp, log
-from gsmerge.kernels.matrices import solve
-from gsmerge.kernels.reproject import find_surfaces
+from gsmerge.method.geometry.transforms import (
+    camera_distances,
+    correlation,
+    medians,
+    order_others,
+    rgb_to_sh0,
+    sh0_to_rgb,
+)
+from gsmerge.method.kernels.elementary import exp, log
+from gsmerge.method.kernels.matrices import solve
+from gsmerge.method.kernels.reproject import find_surfaces
+from gsmerge.method.raster.photos import NEAR_PLANE
 from gsmerge.prepare.photo_change import CLIPPED, PhotoChange, change_large
-from gsmerge.raster.photos import NEAR_PLANE
 from gsmerge.runtime.record import note, record_choices
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.stages import Exposure

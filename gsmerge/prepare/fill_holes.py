@@ -12,16 +12,16 @@ import cv2
 import numpy as np
 
 from gsmerge.frozen import dataclass, replace
-from gsmerge.geometry.gaps import fill_gaps
-from gsmerge.geometry.pixel_gaussians import NEW_SIZE_PIXELS, make_round_gaussians, pixel_rays
-from gsmerge.geometry.transforms import camera_depths, lies_inside, nearest_views
-from gsmerge.kernels.matrices import matmul
-from gsmerge.kernels.pictures import blur
-from gsmerge.kernels.reproject import add_differences
+from gsmerge.method.geometry.gaps import fill_gaps
+from gsmerge.method.geometry.pixel_gaussians import NEW_SIZE_PIXELS, make_round_gaussians, pixel_rays
+from gsmerge.method.geometry.transforms import camera_depths, lies_inside, nearest_views
+from gsmerge.method.kernels.matrices import matmul
+from gsmerge.method.kernels.pictures import blur
+from gsmerge.method.kernels.reproject import add_differences
+from gsmerge.method.raster import TiledView
+from gsmerge.method.raster.composite import blend_depths
+from gsmerge.method.raster.images import tile_views
 from gsmerge.prepare.photo_change import PhotoChange, change_large
-from gsmerge.raster import TiledView
-from gsmerge.raster.composite import blend_depths
-from gsmerge.raster.images import tile_views
 from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Gaussians, PicturedScene, fill_pixels

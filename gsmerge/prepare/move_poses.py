@@ -19,7 +19,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from gsmerge.frozen import dataclass
-from gsmerge.geometry.transforms import (
+from gsmerge.method.geometry.transforms import (
     camera_depths,
     median,
     motion_matrices,
@@ -27,11 +27,11 @@ from gsmerge.geometry.transforms import (
     move_views,
     without_common_motion,
 )
-from gsmerge.kernels.matrices import invert, matmul, solve
-from gsmerge.kernels.pictures import blur
-from gsmerge.kernels.raster.project import view_colors
-from gsmerge.kernels.reproject import SCRATCH_COLUMNS, compare_views, see_points
-from gsmerge.raster.photos import NEAR_PLANE, photos_of
+from gsmerge.method.kernels.matrices import invert, matmul, solve
+from gsmerge.method.kernels.pictures import blur
+from gsmerge.method.kernels.raster.project import view_colors
+from gsmerge.method.kernels.reproject import SCRATCH_COLUMNS, compare_views, see_points
+from gsmerge.method.raster.photos import NEAR_PLANE, photos_of
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import PicturedScene
 

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from gsmerge.compare.colors import map_tones
 from gsmerge.frozen import dataclass, replace
+from gsmerge.method.compare.colors import map_tones
 from gsmerge.types import LargePhotos
 
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)  # brightness of red, green and blue, as in JPEGs (Rec. 601)

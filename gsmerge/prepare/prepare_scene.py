@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from gsmerge.facts.pictures import PHOTOS, ROW_COLORS
-from gsmerge.facts.prepared import Prepared
 from gsmerge.frozen import replace
-from gsmerge.geometry.frame import Frame
+from gsmerge.method.facts.pictures import PHOTOS, ROW_COLORS
+from gsmerge.method.facts.prepared import Prepared
+from gsmerge.method.geometry.frame import Frame
+from gsmerge.method.viewpoints.place_cameras import NO_VIEWS, VIEWER_VIEWS, place_inside
 from gsmerge.prepare.repeats import without_repeats
 from gsmerge.prepare.row_colors import NO_PHOTOS
 from gsmerge.prepare.steps import STEPS, Step, begin, has_changed, select, take_steps
 from gsmerge.runtime.record import record_choices, record_part, stage
 from gsmerge.settings.stages import PrepareOptions
 from gsmerge.types import Scene
-from gsmerge.viewpoints.place_cameras import NO_VIEWS, VIEWER_VIEWS, place_inside
 
 
 @stage("prepare")

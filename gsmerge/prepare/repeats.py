@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsmerge.geometry.views import camera_kinds, subset
+from gsmerge.method.geometry.views import camera_kinds, subset
 from gsmerge.types import Scene
 
 

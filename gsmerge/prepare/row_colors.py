@@ -13,15 +13,15 @@ from typing import TypeVar
 
 import numpy as np
 
-from gsmerge.facts.pictures import ROW_COLORS
 from gsmerge.frozen import dataclass
-from gsmerge.geometry.gaps import fill_gaps
-from gsmerge.geometry.transforms import camera_depths, sh0_to_rgb
-from gsmerge.geometry.views import camera_kinds, subset
-from gsmerge.kernels.pictures import blur
-from gsmerge.raster import make_splats, tile_view
-from gsmerge.raster.composite import blend, view_colors
-from gsmerge.raster.photos import COVERED_TRANSMITTANCE, WHOLE_SHARE, blank_photos
+from gsmerge.method.facts.pictures import ROW_COLORS
+from gsmerge.method.geometry.gaps import fill_gaps
+from gsmerge.method.geometry.transforms import camera_depths, sh0_to_rgb
+from gsmerge.method.geometry.views import camera_kinds, subset
+from gsmerge.method.kernels.pictures import blur
+from gsmerge.method.raster import make_splats, tile_view
+from gsmerge.method.raster.composite import blend, view_colors
+from gsmerge.method.raster.photos import COVERED_TRANSMITTANCE, WHOLE_SHARE, blank_photos
 from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import in_turn
 from gsmerge.types import PicturedScene, Scene

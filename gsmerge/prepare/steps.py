@@ -12,10 +12,12 @@ from typing import cast
 import numpy as np
 
 from gsmerge.errors import count_words
-from gsmerge.facts.pictures import PHOTOS, RENDERS, ROW_COLORS
-from gsmerge.facts.prepared import Prepared, Reference, with_photos
 from gsmerge.frozen import dataclass, replace
-from gsmerge.geometry.frame import Frame, canonicalise
+from gsmerge.method.facts.pictures import PHOTOS, RENDERS, ROW_COLORS
+from gsmerge.method.facts.prepared import Prepared, Reference, with_photos
+from gsmerge.method.geometry.frame import Frame, canonicalise
+from gsmerge.method.raster.photos import counting_pixels
+from gsmerge.method.viewpoints.place_cameras import HELD_OUT, draw_pictures, keep_finite, place_views
 from gsmerge.prepare.compare_photos import compare_photos
 from gsmerge.prepare.confirm_depths import confirm_depths
 from gsmerge.prepare.draw_left_out import draw_left_out, mask_background
@@ -26,11 +28,9 @@ from gsmerge.prepare.move_poses import move_poses
 from gsmerge.prepare.repeats import without_repeats
 from gsmerge.prepare.row_colors import add_row_colors
 from gsmerge.prepare.true_pixels import raise_sizes, with_pixels
-from gsmerge.raster.photos import counting_pixels
 from gsmerge.runtime.record import note, record_choices
 from gsmerge.settings.stages import PrepareOptions
 from gsmerge.types import PicturedScene, Scene
-from gsmerge.viewpoints.place_cameras import HELD_OUT, draw_pictures, keep_finite, place_views
 
 WORLD = Frame(np.zeros(3), 1.0)  # the frame of a scene as it was read
 

@@ -17,13 +17,13 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from gsmerge.geometry.pooling import measure_pixel_sizes
-from gsmerge.geometry.transforms import find_nearest
-from gsmerge.kernels.gaussians.fronts import project_centres, weigh_centres
-from gsmerge.kernels.raster.binning import depth_order
-from gsmerge.raster.images import ONE_AT_A_TIME
-from gsmerge.raster.photos import NEAR_PLANE
-from gsmerge.raster.tiled_view import EPS2D
+from gsmerge.method.geometry.pooling import measure_pixel_sizes
+from gsmerge.method.geometry.transforms import find_nearest
+from gsmerge.method.kernels.gaussians.fronts import project_centres, weigh_centres
+from gsmerge.method.kernels.raster.binning import depth_order
+from gsmerge.method.raster.images import ONE_AT_A_TIME
+from gsmerge.method.raster.photos import NEAR_PLANE
+from gsmerge.method.raster.tiled_view import EPS2D
 from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import in_turn
 from gsmerge.types import Pixels, Scene, SceneT

@@ -19,9 +19,9 @@ from gsmerge.frozen import asdict
 from gsmerge.io.atomic import atomic_output
 from gsmerge.io.bounds import ReadBudget, parse_json, read_budget
 from gsmerge.io.tensor_file import read_tensors
-from gsmerge.networks.checkpoint import IN_PACKAGE, SCHEMA, Checkpoint
-from gsmerge.networks.options import NetworkOptions, weight_shapes
-from gsmerge.networks.weights import NetworkWeights
+from gsmerge.method.networks.checkpoint import IN_PACKAGE, SCHEMA, Checkpoint
+from gsmerge.method.networks.options import NetworkOptions, weight_shapes
+from gsmerge.method.networks.weights import NetworkWeights
 from gsmerge.types import StrPath
 from gsmerge.version import __version__
 

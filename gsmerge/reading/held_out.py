@@ -8,12 +8,12 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.frozen import dataclass, replace
-from gsmerge.geometry.transforms import IDENTITY, Similarity, camera_centres, fit_similarity
 from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, select_views, to_cameras, with_convention
 from gsmerge.io.cameras.read_cameras import read_cameras
 from gsmerge.io.image_names import find_image
 from gsmerge.io.photo_files import as_floats, photo_size
-from gsmerge.kernels.elementary import arccos
+from gsmerge.method.geometry.transforms import IDENTITY, Similarity, camera_centres, fit_similarity
+from gsmerge.method.kernels.elementary import arccos
 from gsmerge.reading.exporters import NO_HINTS
 from gsmerge.reading.larger_photos import limit_photo_size
 from gsmerge.reading.photos.scene_photos import read_stored_photos

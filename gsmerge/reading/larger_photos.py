@@ -16,7 +16,7 @@ from gsmerge.io.photo_files import (
     photo_size,
     resize_to,
 )
-from gsmerge.kernels.matrices import matmul
+from gsmerge.method.kernels.matrices import matmul
 from gsmerge.reading.photos.masks import NO_MASKS, Masks, read_masks
 from gsmerge.reading.photos.scene_photos import ScenePhotos
 from gsmerge.reading.scene_files import SceneFiles

@@ -9,12 +9,12 @@ import numpy as np
 
 from gsmerge.errors import Doubt, Note, SceneError, attempt, count_words
 from gsmerge.frozen import dataclass, replace
-from gsmerge.geometry.transforms import move_views
 from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, to_cameras
 from gsmerge.io.cameras.dataparser import read_dataparser
 from gsmerge.io.formats.read_gaussians import GaussianFile, file_notes
 from gsmerge.io.formats.rows import MAX_STRAY, RESULT_COMMENT
 from gsmerge.io.photo_files import NO_IMAGES, as_floats, photo_size
+from gsmerge.method.geometry.transforms import move_views
 from gsmerge.reading.alignment import AlignmentResult, check_pixels, find_pixels
 from gsmerge.reading.choice import make_choice
 from gsmerge.reading.exporters import ReadHints, choose_exporters, find_cameras_of_model, find_exporter

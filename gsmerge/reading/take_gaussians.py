@@ -7,15 +7,15 @@ from math import prod
 
 import numpy as np
 
-from gsmerge.compare.colors import cut_blocks
-from gsmerge.compare.offsets import OFFSET_PIXELS
-from gsmerge.compare.similarity import stands_out
-from gsmerge.compare.view_pictures import Pairs, show_views
 from gsmerge.errors import Note, split_notes
-from gsmerge.geometry.transforms import camera_depths, rgb_to_sh0, sh0_to_rgb
 from gsmerge.io.formats.read_gaussians import GaussianFile
 from gsmerge.io.formats.units import RGB_NOTE
-from gsmerge.raster.photos import LEAST_OPACITY, shrink_pictures
+from gsmerge.method.compare.colors import cut_blocks
+from gsmerge.method.compare.offsets import OFFSET_PIXELS
+from gsmerge.method.compare.similarity import stands_out
+from gsmerge.method.compare.view_pictures import Pairs, show_views
+from gsmerge.method.geometry.transforms import camera_depths, rgb_to_sh0, sh0_to_rgb
+from gsmerge.method.raster.photos import LEAST_OPACITY, shrink_pictures
 from gsmerge.reading.alignment import AlignmentResult
 from gsmerge.reading.loaded import Loaded
 from gsmerge.types import Gaussians, Pixels

@@ -17,9 +17,9 @@ import numpy as np
 
 from gsmerge.errors import GsmergeError, UsageError
 from gsmerge.frozen import dataclass, replace
-from gsmerge.geometry.frame import Frame, scene_frame
-from gsmerge.geometry.transforms import move_views
-from gsmerge.geometry.views import even_views, subset, take_rows
+from gsmerge.method.geometry.frame import Frame, scene_frame
+from gsmerge.method.geometry.transforms import move_views
+from gsmerge.method.geometry.views import even_views, subset, take_rows
 from gsmerge.run import compact
 from gsmerge.runtime.record import Progress
 from gsmerge.scoring.evaluate import EvaluateOptions, evaluate

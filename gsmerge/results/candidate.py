@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from gsmerge.facts.pictures import RENDERS
-from gsmerge.facts.prepared import Prepared
-from gsmerge.fit import Fitted
 from gsmerge.frozen import dataclass, replace
-from gsmerge.geometry.frame import scene_depth
 from gsmerge.io.cameras.camera_file import describe_moves, list_moves
-from gsmerge.pipelines.plan import Plan, ScorePlan
+from gsmerge.method.facts.pictures import RENDERS
+from gsmerge.method.facts.prepared import Prepared
+from gsmerge.method.fit import Fitted
+from gsmerge.method.geometry.frame import scene_depth
+from gsmerge.method.pipelines.plan import Plan, ScorePlan
 from gsmerge.plan.make_plan import own_views
 from gsmerge.results.scores import compares_all_pixels, measure_renders, measure_result, round_for_output
 from gsmerge.runtime.record import Record, current_record, note, record_choices, record_part, stage

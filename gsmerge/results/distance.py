@@ -10,16 +10,16 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gsmerge.facts.prepared import Prepared
-from gsmerge.fit.outside import outside_cameras, sample_gaussians
-from gsmerge.geometry.views import even_views, resize_cameras
-from gsmerge.kernels.pictures import blur
-from gsmerge.raster import render
-from gsmerge.raster.metrics import decibels
-from gsmerge.raster.photos import shrink_pictures
+from gsmerge.method.facts.prepared import Prepared
+from gsmerge.method.fit.outside import outside_cameras, sample_gaussians
+from gsmerge.method.geometry.views import even_views, resize_cameras
+from gsmerge.method.kernels.pictures import blur
+from gsmerge.method.raster import render
+from gsmerge.method.raster.metrics import decibels
+from gsmerge.method.raster.photos import shrink_pictures
+from gsmerge.method.viewpoints.place_cameras import OUTSIDE_HIGH, OUTSIDE_LOW, between_cameras
 from gsmerge.runtime.record import stage
 from gsmerge.types import Cameras, Gaussians, PicturedScene
-from gsmerge.viewpoints.place_cameras import OUTSIDE_HIGH, OUTSIDE_LOW, between_cameras
 
 WRONG_DB = 20.0  # PSNR below which pictures look wrong; errors are then a tenth of the range of colours
 TWICE_DB = decibels(1 / 4)  # dB between two errors of which one is twice the other (root mean square)

@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from gsmerge.facts.pictures import PHOTOS
-from gsmerge.facts.prepared import Prepared, Reference
 from gsmerge.frozen import dataclass, replace
-from gsmerge.geometry.views import pick_views, subset
-from gsmerge.pipelines.plan import Plan
+from gsmerge.method.facts.pictures import PHOTOS
+from gsmerge.method.facts.prepared import Prepared, Reference
+from gsmerge.method.geometry.views import pick_views, subset
+from gsmerge.method.pipelines.plan import Plan
+from gsmerge.method.raster.photos import NEAR_PLANE, Photos, scene_photos, score_photos
 from gsmerge.plan.make_plan import make_plan
-from gsmerge.raster.photos import NEAR_PLANE, Photos, scene_photos, score_photos
 from gsmerge.scoring.visibility import context_points, visible_pixels
 from gsmerge.settings.compact import OURS, TRIAL, CompactOptions
 from gsmerge.types import Gaussians, PicturedScene

@@ -12,14 +12,14 @@ from time import perf_counter
 
 import numpy as np
 
-from gsmerge.facts.prepared import Prepared
 from gsmerge.frozen import dataclass, replace
-from gsmerge.geometry.transforms import camera_distances
-from gsmerge.geometry.views import subset
-from gsmerge.kernels.elementary import power
-from gsmerge.pipelines.build import build
-from gsmerge.pipelines.plan import Plan
-from gsmerge.raster.photos import shrink_pictures
+from gsmerge.method.facts.prepared import Prepared
+from gsmerge.method.geometry.transforms import camera_distances
+from gsmerge.method.geometry.views import subset
+from gsmerge.method.kernels.elementary import power
+from gsmerge.method.pipelines.build import build
+from gsmerge.method.pipelines.plan import Plan
+from gsmerge.method.raster.photos import shrink_pictures
 from gsmerge.results.left_out import LEAST_SEEN, choose_left_out, leave_out, mean_seen
 from gsmerge.results.report import CompactReport, NewViews, compared_psnr
 from gsmerge.runtime.record import begin_part, record_part
@@ -30,7 +30,7 @@ from gsmerge.types import PicturedScene, Pixels
 
 TRIAL_PIXELS = 120  # the longer side of the small pictures has at least this many pixels
 # Most steps of the fit. With fewer than 150 steps, fits of few views have other settings than longer fits
-# (gsmerge.fit.schedule.MANY_STEPS), and predict less
+# (gsmerge.method.fit.schedule.MANY_STEPS), and predict less
 TRIAL_STEPS = 200
 # Most views of a round: those nearest to the left-out views. Farther views show little of what the left-out views show.
 # With more than TRIAL_VIEWS views, a fit of TRIAL_STEPS steps would also draw each view too seldom to predict a longer

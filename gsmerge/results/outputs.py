@@ -15,11 +15,11 @@ from gsmerge.io.cameras.camera_file import to_cameras
 from gsmerge.io.cameras.read_cameras import read_cameras
 from gsmerge.io.cameras.viewer_cameras import is_own_settings, viewer_cameras, viewer_cameras_path, viewer_settings
 from gsmerge.io.formats.table import TILESET, Contents, Format, output_format
+from gsmerge.method.viewpoints.place_cameras import place_viewpoints
 from gsmerge.plan.counts import STREAMED_LEVELS
 from gsmerge.settings.compact import OURS, CompactOptions
 from gsmerge.settings.files import AXES, FileOptions
 from gsmerge.types import Cameras, Gaussians, Scene
-from gsmerge.viewpoints.place_cameras import place_viewpoints
 
 # Two cameras are the same if their viewmats and Ks differ by rounding alone. Viewmats may differ by this share of the
 # largest translation. Ks may differ by this share of their value, or by a hundred times this number in pixels

@@ -11,7 +11,7 @@ from typing import Any
 from gsmerge.errors import Doubt, count_words, list_doubts
 from gsmerge.frozen import asdict, dataclass, replace
 from gsmerge.io.formats.rows import ExpectedScores
-from gsmerge.raster.metrics import psnr_figure, psnr_words
+from gsmerge.method.raster.metrics import psnr_figure, psnr_words
 from gsmerge.runtime.documents import document_head, note_entries, seconds_document, seconds_line, text_table, wrap_line
 from gsmerge.runtime.memory import human_bytes, human_share
 

@@ -12,14 +12,14 @@ import numpy as np
 
 from gsmerge.arrays import to_float32
 from gsmerge.errors import count_words
-from gsmerge.facts.pictures import OWN_PHOTOS, PHOTOS, RENDERS
-from gsmerge.facts.prepared import Prepared
 from gsmerge.frozen import dataclass, field, replace
 from gsmerge.io.formats.rows import result_comments
 from gsmerge.io.formats.table import Contents
-from gsmerge.pipelines.plan import Plan
+from gsmerge.method.facts.pictures import OWN_PHOTOS, PHOTOS, RENDERS
+from gsmerge.method.facts.prepared import Prepared
+from gsmerge.method.pipelines.plan import Plan
+from gsmerge.method.raster.metrics import SAMPLE_LOSS, describe_distance, describe_loss, is_worse
 from gsmerge.plan.make_plan import own_views
-from gsmerge.raster.metrics import SAMPLE_LOSS, describe_distance, describe_loss, is_worse
 from gsmerge.results.candidate import Candidate, rescore, with_moved_views
 from gsmerge.results.distance import describe_clear_loss, is_clearly_worse
 from gsmerge.results.outputs import NUM_FULL, name_outputs, pad_harmonics, write_outputs

@@ -7,15 +7,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gsmerge.facts.prepared import Prepared
 from gsmerge.frozen import dataclass, replace
-from gsmerge.geometry.views import scored_views
 from gsmerge.io.formats.write import round_as_written
-from gsmerge.pipelines.plan import ScorePlan
-from gsmerge.raster.photos import NEAR_PLANE, WHOLE_SHARE, PhotoScore, scene_photos, score_photos
+from gsmerge.method.facts.prepared import Prepared
+from gsmerge.method.geometry.views import scored_views
+from gsmerge.method.pipelines.plan import ScorePlan
+from gsmerge.method.raster.photos import NEAR_PLANE, WHOLE_SHARE, PhotoScore, scene_photos, score_photos
+from gsmerge.method.stages.prune import ROUNDING
 from gsmerge.results.report import Covered, PhotoFiles
 from gsmerge.runtime.record import stage
-from gsmerge.stages.prune import ROUNDING
 from gsmerge.types import Gaussians, Scene
 
 # The input is scored on one of INPUT_EVERY tiles of the photos. A result is scored on one of RESULT_EVERY tiles,

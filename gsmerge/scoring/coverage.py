@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from gsmerge.raster.photos import LEAST_OPACITY
+from gsmerge.method.raster.photos import LEAST_OPACITY
+from gsmerge.method.stages.clean import BOX_QUANTILES, beyond_scene, floater_share
 from gsmerge.scoring.visibility import VISIBILITY_GAUSSIANS, inside_views
-from gsmerge.stages.clean import BOX_QUANTILES, beyond_scene, floater_share
 from gsmerge.types import Gaussians, Scene
 
 

@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 
 from gsmerge.arrays import ArrayFields, as_pictures
 from gsmerge.errors import Doubt, UsageError, list_doubts
-from gsmerge.facts.pictures import OWN_PHOTOS, PHOTOS, RENDERS, ROW_COLORS
 from gsmerge.frozen import dataclass, field, fields, replace
-from gsmerge.geometry.frame import scene_frame
-from gsmerge.geometry.views import pick_views
+from gsmerge.method.facts.pictures import OWN_PHOTOS, PHOTOS, RENDERS, ROW_COLORS
+from gsmerge.method.geometry.frame import scene_frame
+from gsmerge.method.geometry.views import pick_views
+from gsmerge.method.raster import render
+from gsmerge.method.raster.metrics import describe_loss, psnr_within, ssim_within
+from gsmerge.method.raster.photos import COVERED_TRANSMITTANCE, NEAR_PLANE, WHOLE_SHARE
 from gsmerge.prepare.prepare_scene import scored_pictures
-from gsmerge.raster import render
-from gsmerge.raster.metrics import describe_loss, psnr_within, ssim_within
-from gsmerge.raster.photos import COVERED_TRANSMITTANCE, NEAR_PLANE, WHOLE_SHARE
 from gsmerge.reading.input import check_scene
 from gsmerge.runtime.arguments import check_arguments
 from gsmerge.runtime.record import Progress

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, fields
 from typing import Any
 
-from gsmerge.raster.photos import WHOLE_SHARE
+from gsmerge.method.raster.photos import WHOLE_SHARE
 from gsmerge.runtime.documents import csv_text, document_head, note_entries, text_table, wrap_line
 from gsmerge.runtime.memory import human_bytes, human_share
 from gsmerge.scoring.evaluate import Evaluation, Quality, QualityPair, ResultScores

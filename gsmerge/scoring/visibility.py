@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsmerge.geometry.transforms import is_inside, median, project
-from gsmerge.kernels.matrices import invert, matmul
-from gsmerge.kernels.reproject import mark_pixels
-from gsmerge.raster import render
+from gsmerge.method.geometry.transforms import is_inside, median, project
+from gsmerge.method.kernels.matrices import invert, matmul
+from gsmerge.method.kernels.reproject import mark_pixels
+from gsmerge.method.raster import render
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Scene
 

@@ -36,7 +36,7 @@ class Tuning:
     # Step sizes of Gaussians at the end of a run, relative to their step sizes at the start. Runs of more than 300
     # steps use a smaller factor
     decay: float = 0.4
-    beta1: float = 0.8  # Largest decay of Adam's first moment; gsmerge.fit.schedule.first_decay may give less
+    beta1: float = 0.8  # Largest decay of Adam's first moment; gsmerge.method.fit.schedule.first_decay may give less
     beta2: float = 0.9  # Decay of Adam's second moment
     max_mean_shift: float = 2.0  # Largest shift of a mean, in units of the Gaussian's size
     max_scale_change: float = 2.5  # Largest change of a log scale
@@ -64,7 +64,7 @@ class Tuning:
     # Weight of the mean scale in the loss, relative to each Gaussian's size at its start. This weight lets fewer
     # Gaussians overlap, so that a step takes a third less time
     scale_reg: float = 0.01
-    outside_every: int = 7  # Every so many steps, a view from outside is drawn, see gsmerge.fit.outside
+    outside_every: int = 7  # Every so many steps, a view from outside is drawn, see gsmerge.method.fit.outside
     # Share of the steps before the first view from outside; 1 for no view from outside. Views from outside remove
     # Gaussians in gaps, which at first help other Gaussians to move
     outside_from: float = 0.15

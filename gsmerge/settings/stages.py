@@ -53,8 +53,8 @@ class SegmentOptions(Settings):
     superpixels: int | str = setting(SHARE, "Superpixels per view: a number such as 3000, a share of its pixels, or "
         "auto. auto takes 4.4 to 7 %: the better the "
         "depths of the views agree, the more.")  # fmt: skip
-    segmentation: str = setting("rdseg", "Method that cuts views into superpixels; `gsmerge.stages.superpixels` lists "
-        "all.", choices=SEGMENTATIONS)  # fmt: skip
+    segmentation: str = setting("rdseg", "Method that cuts views into superpixels; "
+        "`gsmerge.method.stages.superpixels` lists all.", choices=SEGMENTATIONS)  # fmt: skip
     rectangles: float | None = setting(None, "Of `rdseg`: number of rectangles per superpixel at its start.",
         "By default by effort: draft and fast 1, default 2, best 3.", least=1, unit="per superpixel")  # fmt: skip
     early_sweeps: int | None = setting(None, "Of `rdseg`: sweeps over border pixels before rectangles are merged.",

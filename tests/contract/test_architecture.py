@@ -32,16 +32,17 @@ def rooms(text: str) -> list[str]:
     return re.findall(r"^\| `([\w/]+)` \|", text, re.MULTILINE)
 
 
-def layers() -> list[str]:
-    """Return the rooms of the import contract, from the top; those of one layer in its order."""
+def layers(name: str) -> list[str]:
+    """Return the folders and modules of an import contract, from the top; those of one layer in its order."""
     tomllib = pytest.importorskip("tomllib", reason="tomllib comes with Python 3.11")
     contracts = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["importlinter"]["contracts"]
-    (contract,) = [one for one in contracts if one["name"] == "Imports flow down"]
+    (contract,) = [one for one in contracts if one["name"] == name]
     return [name for layer in contract["layers"] for name in layer.split(" | ")]
 
 
 def test_rooms_of_the_page_follow_the_import_contract() -> None:
-    assert [room.rstrip("/") for room in rooms(section("Rooms"))] == layers()
+    assert [room.rstrip("/") for room in rooms(section("Rooms"))] == layers("Imports flow down")
+    assert [room.rstrip("/") for room in rooms(section("Method"))] == layers("Imports of the method flow down")
 
 
 def test_rooms_are_the_folders_and_modules_of_the_package() -> None:

@@ -13,7 +13,7 @@ import pytest
 from scripts import load_script
 
 from gsmerge import __version__
-from gsmerge.kernels.build import find_platform
+from gsmerge.method.kernels.build import find_platform
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")

@@ -22,16 +22,18 @@ from gsmerge.blocks import partition
 from gsmerge.counts import curve
 from gsmerge.drawing import render_files as drawings
 from gsmerge.drawing.pages import data, splats
-from gsmerge.facts import agreement, scene_size
-from gsmerge.facts.prepared import LEAST_VIEWS
-from gsmerge.fit import outside, photo_sizes, schedule, stage
-from gsmerge.fit import report as fit_report
-from gsmerge.geometry import views
 from gsmerge.io import bounds, photo_files
 from gsmerge.io.formats import ply
-from gsmerge.kernels.raster import blend
-from gsmerge.networks.checkpoint import IN_PACKAGE
-from gsmerge.networks.options import RESIDUAL, SLOTS
+from gsmerge.method.facts import agreement, scene_size
+from gsmerge.method.facts.prepared import LEAST_VIEWS
+from gsmerge.method.fit import outside, photo_sizes, schedule, stage
+from gsmerge.method.fit import report as fit_report
+from gsmerge.method.geometry import views
+from gsmerge.method.kernels.raster import blend
+from gsmerge.method.networks.checkpoint import IN_PACKAGE
+from gsmerge.method.networks.options import RESIDUAL, SLOTS
+from gsmerge.method.raster import metrics, photos, tiled_view
+from gsmerge.method.stages import fit_pairs, sky
 from gsmerge.plan import counts
 from gsmerge.plan import fit as fit_plan
 from gsmerge.plan.blocks import BLOCK_GAUSSIANS, BLOCK_VIEWS, WHOLE_GAUSSIANS, WHOLE_VIEWS
@@ -39,7 +41,6 @@ from gsmerge.plan.efforts import EFFORTS
 from gsmerge.plan.make_plan import LONE_K
 from gsmerge.prepare import exposure
 from gsmerge.prepare import fill_holes as holes
-from gsmerge.raster import metrics, photos, tiled_view
 from gsmerge.reading.alignment import align_rows as rows_first
 from gsmerge.reading.alignment import score
 from gsmerge.reading.alignment import score as cameras_off
@@ -55,7 +56,6 @@ from gsmerge.settings.compact import RECIPES, method_names
 from gsmerge.settings.extend import ExtendOptions
 from gsmerge.settings.fit import FitOptions, Tuning
 from gsmerge.settings.stages import MAX_CHILDREN, SHARE, MatchOptions
-from gsmerge.stages import fit_pairs, sky
 
 ROOT = Path(__file__).parents[2]
 FIT, RATES, PAPER = FitOptions(), Tuning(), RECIPES["paper"]

@@ -16,7 +16,7 @@ from comfyui import Bar, CancelError, Splat, modules
 from shared import make_once, write_small
 
 import gsmerge
-from gsmerge.kernels.elementary import arctan2
+from gsmerge.method.kernels.elementary import arctan2
 
 torch = pytest.importorskip("torch", reason="torch is not installed")
 

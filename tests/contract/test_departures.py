@@ -12,15 +12,15 @@ import pytest
 from network_fixtures import made, noisy, untrained
 
 from gsmerge.arrays import as_array
-from gsmerge.networks.apply import encode_features
-from gsmerge.networks.checkpoint import IN_PACKAGE
-from gsmerge.networks.corrections import residual_limits
-from gsmerge.networks.options import ABSOLUTE_BOUNDS, GROUP_COLUMNS, NetworkOptions, weight_shapes
+from gsmerge.method.networks.apply import encode_features
+from gsmerge.method.networks.checkpoint import IN_PACKAGE
+from gsmerge.method.networks.corrections import residual_limits
+from gsmerge.method.networks.options import ABSOLUTE_BOUNDS, GROUP_COLUMNS, NetworkOptions, weight_shapes
+from gsmerge.method.stages.decode import decode
+from gsmerge.method.stages.superpixels import segment
 from gsmerge.reading.checkpoint import load_checkpoint
 from gsmerge.settings.compact import RECIPES
 from gsmerge.settings.stages import DecodeOptions, SegmentOptions
-from gsmerge.stages.decode import decode
-from gsmerge.stages.superpixels import segment
 
 PAGE = Path(__file__).parents[2] / "docs" / "results.md"
 TITLE = "## Where the recipe departs from the paper"

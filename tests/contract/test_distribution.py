@@ -20,7 +20,7 @@ import pytest
 
 import gsmerge
 from gsmerge.errors import NO_TORCH
-from gsmerge.kernels.build import find_platform
+from gsmerge.method.kernels.build import find_platform
 
 pytest.importorskip("setuptools", minversion="77")
 tomllib = pytest.importorskip("tomllib", reason="tomllib comes with Python 3.11")
@@ -67,7 +67,7 @@ def test_the_wheel_holds_every_file_of_the_package(built: Path) -> None:
     for name in (
         "drawing/pages/vendor/spark-three.js.gz",
         "drawing/pages/templates/view.html",
-        "networks/shipped.safetensors",
+        "method/networks/shipped.safetensors",
         "py.typed",
     ):
         assert f"gsmerge/{name}" in names
@@ -85,7 +85,7 @@ def test_the_wheel_holds_the_library_of_its_platform(built: Path) -> None:
     assert wheel.name == f"gsmerge-{gsmerge.__version__}-py3-none-{tag}.whl"
     here = find_platform()
     libraries = {name for name in zipfile.ZipFile(wheel).namelist() if "/kernels-" in name}
-    assert libraries == {f"gsmerge/kernels/{here.library_name(target)}" for target in here.targets}
+    assert libraries == {f"gsmerge/method/kernels/{here.library_name(target)}" for target in here.targets}
     (archive,) = (built / "dist").glob("*.tar.gz")
     with tarfile.open(archive) as file:
         assert [name for name in file.getnames() if "/kernels-" in name] == []

@@ -10,11 +10,11 @@ from dataclasses import fields
 from pathlib import Path
 
 import gsmerge
-from gsmerge.facts.prepared import Prepared
+from gsmerge.method.facts.prepared import Prepared
 from gsmerge.settings.stages import PrepareOptions
 
 PACKAGE = Path(gsmerge.__file__).parent
-STEPS = ("prepare", "stages", "fit")
+STEPS = ("prepare", "method/stages", "method/fit")
 
 
 @functools.cache
@@ -31,7 +31,7 @@ def functions(text: str) -> Iterator[ast.FunctionDef]:
 def test_pipelines_nest_no_functions() -> None:
     nested = [
         inner.name
-        for text in texts("pipelines").values()
+        for text in texts("method/pipelines").values()
         for outer in functions(text)
         for inner in ast.walk(outer)
         if isinstance(inner, ast.FunctionDef) and inner is not outer

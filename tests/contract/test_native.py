@@ -4,15 +4,15 @@ import importlib
 import pkgutil
 import re
 
-import gsmerge.kernels
-from gsmerge.kernels.build import FOLDER
-from gsmerge.kernels.raster.step import STEP
-from gsmerge.kernels.signature import PROTOTYPES
+import gsmerge.method.kernels
+from gsmerge.method.kernels.build import FOLDER
+from gsmerge.method.kernels.raster.step import STEP
+from gsmerge.method.kernels.signature import PROTOTYPES
 
 
 def prototypes():
     """Return the declarations in C, by name, of everything that calls the library."""
-    for module in pkgutil.walk_packages(gsmerge.kernels.__path__, "gsmerge.kernels."):
+    for module in pkgutil.walk_packages(gsmerge.method.kernels.__path__, "gsmerge.method.kernels."):
         if "-" not in module.name:  # a built library
             importlib.import_module(module.name)
     return PROTOTYPES

@@ -34,7 +34,7 @@ OTHERS = (
     "drawing/preview.py",
     "research/",
     "scoring/lpips.py",
-    "networks/tensors.py",
+    "method/networks/tensors.py",
 )
 ALLOWED = {
     ("io/cameras/camera_file.py", "cv2.remap"),  # of bytes: whole numbers

@@ -39,9 +39,9 @@ for words in {told!r}:
     assert main(words) == 0
 assert main(["compact", "room", "--magic"]) == 2
 loaded, kinds = [m for m in sys.modules if "." not in m], []
-import gsmerge.raster, gsmerge.jobs.inspect
+import gsmerge.method.raster, gsmerge.jobs.inspect
 kinds += [type(gsmerge.render).__name__, type(gsmerge.inspect).__name__]
-import gsmerge.pipelines.pixel_rows
+import gsmerge.method.pipelines.pixel_rows
 kinds += [type(gsmerge.render).__name__, type(gsmerge.inspect).__name__]
 print()
 for words in (one, loaded, kinds):
@@ -70,7 +70,7 @@ assert main({arguments[1]!r}) == 0
 """
     heavy = ("linalg", "ndimage", "optimize", "spatial", "sparse")
     never = {"torch", "skimage", "matplotlib", "pydantic", *(f"scipy.{name}" for name in heavy)}
-    (loaded,) = (line for line in run_python(code).splitlines() if "gsmerge.pipelines.pixel_rows" in line)
+    (loaded,) = (line for line in run_python(code).splitlines() if "gsmerge.method.pipelines.pixel_rows" in line)
     assert never.isdisjoint(loaded.split())
     assert outputs[0].read_bytes() == outputs[1].read_bytes()
 

@@ -45,7 +45,7 @@ from gsmerge.io.formats.table import Contents
 from gsmerge.io.photo_files import decode_alpha, decode_levels
 from gsmerge.jobs.states.compactor import Compactor
 from gsmerge.jobs.states.state_file import load_state
-from gsmerge.kernels.matrices import invert
+from gsmerge.method.kernels.matrices import invert
 from gsmerge.reading.checkpoint import load_checkpoint
 from gsmerge.reading.read_scene import load_scene
 from gsmerge.settings.compact import CompactOptions

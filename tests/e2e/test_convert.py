@@ -17,13 +17,13 @@ from sweeps import sweep
 
 import gsmerge
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.geometry.transforms import covariances
 from gsmerge.io.atomic import AddOutput
 from gsmerge.io.cameras.viewer_cameras import viewer_cameras, viewer_cameras_path
 from gsmerge.io.formats import table as formats
 from gsmerge.io.formats.streamed import read_index, read_level
 from gsmerge.io.formats.table import Contents, Format
 from gsmerge.jobs.convert import ConvertOptions, convert_files, find_placement, rotation_between
+from gsmerge.method.geometry.transforms import covariances
 from gsmerge.results.outputs import join_gaussians, name_outputs
 from gsmerge.settings.files import AXES, PlacementOptions
 from gsmerge.settings.stages import CleanOptions

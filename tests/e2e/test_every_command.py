@@ -16,7 +16,7 @@ from sweeps import sweep
 import gsmerge
 from gsmerge.cli import main
 from gsmerge.drawing.render_files import picture_stems
-from gsmerge.kernels import elementary
+from gsmerge.method.kernels import elementary
 
 from .conftest import Run, assert_refused, listing
 

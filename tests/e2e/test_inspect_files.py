@@ -20,7 +20,7 @@ from sweeps import sweep
 import gsmerge
 from gsmerge.cli import main
 from gsmerge.io import write_gaussians
-from gsmerge.networks.checkpoint import IN_PACKAGE
+from gsmerge.method.networks.checkpoint import IN_PACKAGE
 
 from .conftest import Run, assert_refused, listing
 

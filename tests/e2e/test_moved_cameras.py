@@ -16,7 +16,7 @@ from messages import ERROR, names, noted
 from shared import write_small, write_smallest
 from tiny_scene import edited_json
 
-from gsmerge.kernels import elementary
+from gsmerge.method.kernels import elementary
 
 from .conftest import Run, assert_refused
 

@@ -12,9 +12,9 @@ import pytest
 from floors import nudged
 
 import gsmerge
-from gsmerge.geometry.views import resize_cameras
 from gsmerge.io import read_images
-from gsmerge.raster.metrics import psnr
+from gsmerge.method.geometry.views import resize_cameras
+from gsmerge.method.raster.metrics import psnr
 from gsmerge.research.generate import GenerateOptions, NoiseOptions, generate_scene
 from gsmerge.scoring.sizes import resize_photo
 

@@ -11,7 +11,7 @@ from shared import write_scene
 
 import gsmerge
 from e2e.conftest import Run
-from gsmerge.raster.metrics import psnr
+from gsmerge.method.raster.metrics import psnr
 
 SIGN = slice(20, 34), slice(30, 52)  # of 64 x 96 pixels: 5 %
 

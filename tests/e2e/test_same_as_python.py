@@ -16,7 +16,7 @@ from shared import write_smallest
 import gsmerge
 import gsmerge.reading.input as stage
 from gsmerge.errors import SceneError
-from gsmerge.geometry.views import subset
+from gsmerge.method.geometry.views import subset
 from gsmerge.reading.scene_files import find_scene_files
 from gsmerge.results.outputs import Outputs
 from gsmerge.run import compact_files

@@ -10,7 +10,7 @@ from shared import write_scene
 from sweeps import sweep
 
 import gsmerge
-from gsmerge.networks.checkpoint import SHIPPED
+from gsmerge.method.networks.checkpoint import SHIPPED
 
 LEAST_GAIN = 1.0  # dB on photos that the scene was not made from
 

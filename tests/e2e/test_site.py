@@ -15,7 +15,7 @@ from browser import CHROMIUM, Browser, browser, needs_browser
 from shared import make_once, write_small
 
 import gsmerge
-from gsmerge.raster.metrics import psnr
+from gsmerge.method.raster.metrics import psnr
 from gsmerge.scoring.evaluate import near_plane
 
 from .conftest import Run, assert_refused

@@ -21,8 +21,8 @@ from tiny_scene import edited_json
 import gsmerge
 from gsmerge import read_scene
 from gsmerge.counts.search import MAX_BUILDS
+from gsmerge.method.raster.metrics import MAX_LOSS
 from gsmerge.plan.counts import FIDELITY_LOSS
-from gsmerge.raster.metrics import MAX_LOSS
 
 from .conftest import Run
 

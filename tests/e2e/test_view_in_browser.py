@@ -15,8 +15,8 @@ from shared import make_once, write_scene
 import gsmerge
 from gsmerge.cli import main
 from gsmerge.drawing.camera_path import outside_camera
-from gsmerge.geometry.transforms import middle_depth, rotmat_to_quat
-from gsmerge.raster.metrics import psnr
+from gsmerge.method.geometry.transforms import middle_depth, rotmat_to_quat
+from gsmerge.method.raster.metrics import psnr
 from gsmerge.scoring.evaluate import near_plane
 
 pytestmark = needs_browser()

@@ -13,7 +13,7 @@ from shared import write_smallest
 from sweeps import sweep
 
 import gsmerge
-from gsmerge.facts.pictures import ROW_COLORS
+from gsmerge.method.facts.pictures import ROW_COLORS
 from gsmerge.prepare.row_colors import NO_PHOTOS
 
 from .conftest import Run

@@ -16,8 +16,8 @@ from sweeps import sweep
 
 import gsmerge
 from gsmerge import Scene
-from gsmerge.geometry.views import subset
-from gsmerge.raster.metrics import MAX_LOSS
+from gsmerge.method.geometry.views import subset
+from gsmerge.method.raster.metrics import MAX_LOSS
 
 from .conftest import Run
 

@@ -16,9 +16,9 @@ from shared import write_scene
 from tiny_scene import edited_json
 
 from gsmerge import to_cameras
-from gsmerge.geometry.transforms import pose_changes
 from gsmerge.io import write_gaussians
 from gsmerge.io.cameras.read_cameras import read_cameras
+from gsmerge.method.geometry.transforms import pose_changes
 from gsmerge.reading.read_scene import load_scene
 
 from .conftest import Run

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gsmerge import Gaussians
-from gsmerge.geometry.transforms import normalize
+from gsmerge.method.geometry.transforms import normalize
 
 
 def some(count: int, seed: int = 0, degree: int = 1) -> Gaussians:

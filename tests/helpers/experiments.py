@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from gsmerge.kernels import elementary
+from gsmerge.method.kernels import elementary
 from gsmerge.research.charts.measure_run import RunRecord, describe_run
 
 SCENES = ("apples", "fern", "fox")

@@ -10,10 +10,10 @@ import numpy as np
 from plyfile import PlyData, PlyElement
 from tiny_scene import Tiny, make_tiny, rotation, write_images, write_transforms
 
-from gsmerge.geometry.transforms import quat_to_rotmat, rotmat_to_quat
-from gsmerge.kernels import elementary
-from gsmerge.kernels.matrices import invert, matmul
-from gsmerge.kernels.pictures import blur
+from gsmerge.method.geometry.transforms import quat_to_rotmat, rotmat_to_quat
+from gsmerge.method.kernels import elementary
+from gsmerge.method.kernels.matrices import invert, matmul
+from gsmerge.method.kernels.pictures import blur
 from gsmerge.types import SH_C0, Scene
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gsmerge import Gaussians
-from gsmerge.kernels import elementary
+from gsmerge.method.kernels import elementary
 
 
 def random_gaussians(

@@ -37,7 +37,7 @@ from plyfile import PlyData
 from sharp_files import write_elements
 from tiny_scene import rotation, save_json, write_colmap_binary, write_images, write_inria, write_npz
 
-from gsmerge.kernels.matrices import invert, matmul
+from gsmerge.method.kernels.matrices import invert, matmul
 from gsmerge.types import Gaussians
 
 

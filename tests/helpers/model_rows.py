@@ -11,9 +11,9 @@ import numpy as np
 from exports import Smooth, export_rows, save_export, smooth_scene, turned, with_surface_rotations
 from tiny_scene import save_json, write_images, write_transforms
 
-from gsmerge.geometry.transforms import normalize
-from gsmerge.kernels import elementary
-from gsmerge.kernels.matrices import matmul
+from gsmerge.method.geometry.transforms import normalize
+from gsmerge.method.kernels import elementary
+from gsmerge.method.kernels.matrices import matmul
 from gsmerge.types import Gaussians, Scene
 
 HALF = np.sqrt(0.5)

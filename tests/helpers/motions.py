@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from gsmerge import Scene
-from gsmerge.geometry.transforms import motion_matrices, move_views
-from gsmerge.kernels.matrices import matmul
+from gsmerge.method.geometry.transforms import motion_matrices, move_views
+from gsmerge.method.kernels.matrices import matmul
 
 
 def random_motions(count: int, degrees: float, shift: float) -> np.ndarray:

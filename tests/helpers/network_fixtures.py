@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 from scenes import arc, make_scene, room
 
-from gsmerge.geometry.pooling import Members, scene_members
-from gsmerge.networks.apply import NetworkContext
-from gsmerge.networks.options import NetworkOptions, weight_shapes
-from gsmerge.networks.weights import NetworkWeights
+from gsmerge.method.geometry.pooling import Members, scene_members
+from gsmerge.method.networks.apply import NetworkContext
+from gsmerge.method.networks.options import NetworkOptions, weight_shapes
+from gsmerge.method.networks.weights import NetworkWeights
+from gsmerge.method.stages.encode import encode
 from gsmerge.reading.checkpoint import save_checkpoint
-from gsmerge.stages.encode import encode
 from gsmerge.types import FeatureGaussians, Groups, Scene
 
 SMALL = NetworkOptions(width=16, heads=2, latent=8, members=8, neighbors=4)

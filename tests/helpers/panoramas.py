@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsmerge.compare.view_pictures import ViewPictures
-from gsmerge.kernels.pictures import blur
-from gsmerge.raster.photos import shrink_pictures
+from gsmerge.method.compare.view_pictures import ViewPictures
+from gsmerge.method.kernels.pictures import blur
+from gsmerge.method.raster.photos import shrink_pictures
 
 WIDTH, HEIGHT, STEP = 256, 192, 48  # pixels of a view, and between two
 

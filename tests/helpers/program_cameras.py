@@ -11,8 +11,8 @@ import numpy as np
 import scenes
 from tiny_scene import FLIP
 
-from gsmerge.geometry.transforms import motion_vectors
-from gsmerge.kernels.matrices import invert, matmul
+from gsmerge.method.geometry.transforms import motion_vectors
+from gsmerge.method.kernels.matrices import invert, matmul
 
 VIEWS, WIDTH, HEIGHT = 3, 24, 16
 W2C = scenes.arc(VIEWS, WIDTH, HEIGHT).viewmats.astype(np.float64)

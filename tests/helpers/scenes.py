@@ -17,13 +17,13 @@ import numpy as np
 from floors import nudged
 
 from gsmerge import Cameras, Gaussians, Scene, compact, render
-from gsmerge.fit import FitJob, FitOptions
-from gsmerge.fit.schedule import FitRun, prepare_fit
-from gsmerge.geometry.transforms import covariances, normalize, quat_to_rotmat, rotmat_to_quat
-from gsmerge.geometry.views import subset, take_rows
-from gsmerge.kernels import elementary
-from gsmerge.kernels.matrices import invert, matmul
-from gsmerge.raster.photos import Photos, scene_photos
+from gsmerge.method.fit import FitJob, FitOptions
+from gsmerge.method.fit.schedule import FitRun, prepare_fit
+from gsmerge.method.geometry.transforms import covariances, normalize, quat_to_rotmat, rotmat_to_quat
+from gsmerge.method.geometry.views import subset, take_rows
+from gsmerge.method.kernels import elementary
+from gsmerge.method.kernels.matrices import invert, matmul
+from gsmerge.method.raster.photos import Photos, scene_photos
 from gsmerge.research.generate import objects, photograph, shapes
 from gsmerge.research.generate.noise import Noise, TrueView, pixel_gaussians
 from gsmerge.research.generate.synthetic_scene import look_at as camera_to_world

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from gsmerge.kernels import elementary
+from gsmerge.method.kernels import elementary
 
 SIDE = 476  # longer side of the photos, pixels; densities are superpixels per SIDE x SIDE pixels
 DENSITIES = (5_000, 12_000, 23_000)

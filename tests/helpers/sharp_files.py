@@ -11,9 +11,9 @@ import numpy as np
 from plyfile import PlyData, PlyElement
 
 from gsmerge import Scene
-from gsmerge.geometry.transforms import multiply_quats, rotmat_to_quat
-from gsmerge.kernels import elementary
-from gsmerge.kernels.matrices import matmul
+from gsmerge.method.geometry.transforms import multiply_quats, rotmat_to_quat
+from gsmerge.method.kernels import elementary
+from gsmerge.method.kernels.matrices import matmul
 from gsmerge.types import Cameras, Gaussians
 
 COLUMNS = ["x", "y", "z", *(f"f_dc_{i}" for i in range(3)), "opacity", *(f"scale_{i}" for i in range(3)),

@@ -11,9 +11,9 @@ import numpy as np
 import scenes
 
 from gsmerge import Gaussians, Scene
-from gsmerge.geometry.transforms import normalize
 from gsmerge.io import read_gaussians
-from gsmerge.kernels import elementary
+from gsmerge.method.geometry.transforms import normalize
+from gsmerge.method.kernels import elementary
 from gsmerge.types import SH_C0
 
 

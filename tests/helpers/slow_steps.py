@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsmerge.fit.fit_state import FitState
-from gsmerge.fit.schedule import Step
-from gsmerge.fit.steps import Optimiser
-from gsmerge.kernels.gaussians.optimise import adam
-from gsmerge.kernels.raster import step as step_kernels
-from gsmerge.raster import tile_view
-from gsmerge.raster.composite import blend, view_colors
-from gsmerge.raster.gradient import Gradients, gradients_of
+from gsmerge.method.fit.fit_state import FitState
+from gsmerge.method.fit.schedule import Step
+from gsmerge.method.fit.steps import Optimiser
+from gsmerge.method.kernels.gaussians.optimise import adam
+from gsmerge.method.kernels.raster import step as step_kernels
+from gsmerge.method.raster import tile_view
+from gsmerge.method.raster.composite import blend, view_colors
+from gsmerge.method.raster.gradient import Gradients, gradients_of
 
 
 def step_slowly(optimiser: Optimiser, state: FitState, step: Step) -> float:

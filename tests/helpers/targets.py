@@ -7,8 +7,8 @@ from contextlib import suppress
 from unittest import mock
 
 from gsmerge.errors import UsageError
-from gsmerge.kernels.build import find_platform
-from gsmerge.kernels.library import load_library
+from gsmerge.method.kernels.build import find_platform
+from gsmerge.method.kernels.library import load_library
 
 
 def runnable_targets() -> list[str]:

@@ -14,10 +14,10 @@ from typing import Any
 import cv2
 import numpy as np
 
-from gsmerge.geometry.transforms import normalize, quat_to_rotmat, rotmat_to_quat
 from gsmerge.io import CameraFile, write_ply
-from gsmerge.kernels import elementary
-from gsmerge.kernels.matrices import invert, matmul
+from gsmerge.method.geometry.transforms import normalize, quat_to_rotmat, rotmat_to_quat
+from gsmerge.method.kernels import elementary
+from gsmerge.method.kernels.matrices import invert, matmul
 from gsmerge.types import Gaussians
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])

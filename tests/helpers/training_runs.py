@@ -14,8 +14,8 @@ pytest.importorskip("torch", reason="torch is not installed")
 import numpy as np
 import torch
 
-from gsmerge.networks.options import NetworkOptions
-from gsmerge.networks.weights import NetworkWeights
+from gsmerge.method.networks.options import NetworkOptions
+from gsmerge.method.networks.weights import NetworkWeights
 from gsmerge.research.training import Example, Shard, TrainOptions, write_shard
 from gsmerge.research.training.modules import Networks
 from gsmerge.research.training.windows import Box, Crop, Window

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from gsmerge import Gaussians, Scene
-from gsmerge.geometry.transforms import normalize
+from gsmerge.method.geometry.transforms import normalize
 
 
 def without_order(scene: Scene, order: np.ndarray | None = None) -> Scene:

@@ -8,7 +8,7 @@ import numpy as np
 from slow_renderer import turned_cameras
 
 from gsmerge import Gaussians
-from gsmerge.raster import TiledView, make_splats, tile_view
+from gsmerge.method.raster import TiledView, make_splats, tile_view
 
 
 def turned_view(gaussians: Gaussians, **options: Any) -> TiledView:

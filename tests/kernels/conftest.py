@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from targets import runnable_targets
 
-from gsmerge.kernels.library import load_library
+from gsmerge.method.kernels.library import load_library
 
 Function = Callable[[], Sequence[np.ndarray]]
 

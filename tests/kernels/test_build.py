@@ -12,8 +12,8 @@ from messages import refuses
 from scripts import load_script
 from sweeps import sweep
 
-from gsmerge.kernels import build as module
-from gsmerge.kernels.build import build_libraries, compiler, find_platform, hash_sources
+from gsmerge.method.kernels import build as module
+from gsmerge.method.kernels.build import build_libraries, compiler, find_platform, hash_sources
 
 HEADS = {"linux": b"\x7fELF", "macosx": b"\xcf\xfa\xed\xfe", "win": b"MZ"}
 PLATFORMS = (  # the first has one target alone, which takes the least time

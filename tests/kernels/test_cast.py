@@ -7,8 +7,8 @@ import pytest
 from messages import refuses
 from sweeps import sweep
 
-from gsmerge.kernels import elementary
-from gsmerge.kernels.cast import BLOB, BOX, CONE, ELLIPSOID, LEAF, QUAD, add_light, cast
+from gsmerge.method.kernels import elementary
+from gsmerge.method.kernels.cast import BLOB, BOX, CONE, ELLIPSOID, LEAF, QUAD, add_light, cast
 from gsmerge.research.generate.shapes import NO_WAVES, Material, Shape, ShapeArrays, pack_shapes
 
 FAR, STEPS, EXACT = 12.0, 6_000, 1e-7

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from gsmerge.kernels.elementary import arccos, arctan2, cos, exp, expm1, log, log1p, log10, power, sin
+from gsmerge.method.kernels.elementary import arccos, arctan2, cos, exp, expm1, log, log1p, log10, power, sin
 
 RNG = np.random.default_rng(0)
 ENDS = np.array([0.0, -0.0, 1.0, -1.0, np.inf, -np.inf, np.nan, -np.nan, 1e300, -1e300, 5e-324, 1e-310, -1e-17])

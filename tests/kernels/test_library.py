@@ -15,9 +15,9 @@ from numpy.random import mtrand
 from targets import runnable_targets
 
 from gsmerge.errors import UsageError
-from gsmerge.kernels import library as module
-from gsmerge.kernels.build import ARM64, FOLDER, V3, V4, Platform, find_platform, hash_sources
-from gsmerge.kernels.library import load_library
+from gsmerge.method.kernels import library as module
+from gsmerge.method.kernels.build import ARM64, FOLDER, V3, V4, Platform, find_platform, hash_sources
+from gsmerge.method.kernels.library import load_library
 
 
 @pytest.fixture(autouse=True)

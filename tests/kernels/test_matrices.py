@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsmerge.kernels.matrices import closest_rotation, determinant, eigh, invert, matmul, solve, solve_symmetric
+from gsmerge.method.kernels.matrices import closest_rotation, determinant, eigh, invert, matmul, solve, solve_symmetric
 
 RNG = np.random.default_rng(0)
 

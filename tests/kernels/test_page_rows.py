@@ -9,8 +9,8 @@ import pytest
 import scenes
 
 from gsmerge.io.formats.spz import COLOR_SCALE, spz_columns
-from gsmerge.kernels.elementary import exp, log
-from gsmerge.kernels.page_rows import LOOKS, pack_looks, pack_pixels
+from gsmerge.method.kernels.elementary import exp, log
+from gsmerge.method.kernels.page_rows import LOOKS, pack_looks, pack_pixels
 from gsmerge.types import SH_C0, Gaussians
 
 N = 300

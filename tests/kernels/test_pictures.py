@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from gsmerge.kernels.pictures import blur, convolve, enlarge, sample_bilinear, sobel
+from gsmerge.method.kernels.pictures import blur, convolve, enlarge, sample_bilinear, sobel
 
 RNG = np.random.default_rng(0)
 SHAPES = [(20, 31, 3), (20, 31), (1, 1), (1, 7, 2), (9, 1), (2, 2, 4), (3, 200)]

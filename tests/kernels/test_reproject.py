@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsmerge.geometry.transforms import camera_depths, motion_matrices, project_points
-from gsmerge.kernels.elementary import exp, log, log1p
-from gsmerge.kernels.matrices import matmul
-from gsmerge.kernels.pictures import sample_bilinear
-from gsmerge.kernels.reproject import (
+from gsmerge.method.geometry.transforms import camera_depths, motion_matrices, project_points
+from gsmerge.method.kernels.elementary import exp, log, log1p
+from gsmerge.method.kernels.matrices import matmul
+from gsmerge.method.kernels.pictures import sample_bilinear
+from gsmerge.method.kernels.reproject import (
     SCRATCH_COLUMNS,
     add_differences,
     compare_views,

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from messages import refuses
 
-from gsmerge.kernels.raster.binning import MOST_TILES, count_boxes, deal_tiles, sort_bits
-from gsmerge.kernels.raster.project import CAMERA, cull
-from gsmerge.kernels.signature import FilledTable, Table, f4
+from gsmerge.method.kernels.raster.binning import MOST_TILES, count_boxes, deal_tiles, sort_bits
+from gsmerge.method.kernels.raster.project import CAMERA, cull
+from gsmerge.method.kernels.signature import FilledTable, Table, f4
 
 
 def arrays(m=3):

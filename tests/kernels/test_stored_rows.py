@@ -11,7 +11,7 @@ from plyfile import PlyData, PlyElement
 
 from gsmerge.io.formats import read_gaussians
 from gsmerge.io.formats import rows as arrays
-from gsmerge.kernels.stored_rows import convert_rows
+from gsmerge.method.kernels.stored_rows import convert_rows
 
 N = 200
 ODD = {

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from scenes import make_features
 from skimage.measure import label as connected_parts
 
-from gsmerge.geometry.pooling import Members, gaussian_members
-from gsmerge.stages.decode import split_counts
-from gsmerge.stages.segment import RegionTree, SegmentOptions, cut_tree, region_tree, segment
+from gsmerge.method.geometry.pooling import Members, gaussian_members
+from gsmerge.method.stages.decode import split_counts
+from gsmerge.method.stages.segment import RegionTree, SegmentOptions, cut_tree, region_tree, segment
 from gsmerge.types import FeatureGaussians, Gaussians, Groups
 
 FEW = settings(max_examples=25, deadline=None, derandomize=True)

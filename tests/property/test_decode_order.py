@@ -9,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import assert_same_set, make_features
 
-from gsmerge.geometry.pooling import Members, gaussian_members
-from gsmerge.kernels.elementary import exp
+from gsmerge.method.geometry.pooling import Members, gaussian_members
+from gsmerge.method.kernels.elementary import exp
+from gsmerge.method.stages.decode import decode
 from gsmerge.settings.stages import DecodeOptions
-from gsmerge.stages.decode import decode
 from gsmerge.types import FeatureGaussians, Gaussians
 
 FEW = settings(max_examples=15, deadline=None, derandomize=True)

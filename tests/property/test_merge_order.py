@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import make_features, random_rotation
 
+from gsmerge.method.stages.match import match
+from gsmerge.method.stages.merge import merge, take_features
 from gsmerge.settings.stages import MatchOptions
-from gsmerge.stages.match import match
-from gsmerge.stages.merge import merge, take_features
 from gsmerge.types import FeatureGaussians, Matches
 
 FEW = settings(max_examples=20, deadline=None, derandomize=True)

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from skimage.measure import label as connected_parts
 
-from gsmerge.stages.superpixels import superpixels
+from gsmerge.method.stages.superpixels import superpixels
 
 SEGMENTATIONS = [
     ("rdseg", {"rectangles": 1.0, "early_sweeps": 0}),

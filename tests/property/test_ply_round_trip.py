@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from gsmerge.io import read_ply, write_ply
-from gsmerge.kernels import elementary
+from gsmerge.method.kernels import elementary
 from gsmerge.types import Gaussians
 
 

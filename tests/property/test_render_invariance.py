@@ -7,10 +7,10 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from gsmerge import Cameras, Gaussians
-from gsmerge.geometry.transforms import normalize
-from gsmerge.kernels import elementary
-from gsmerge.raster import composite, contributions, make_splats, render, splat_adjoint, tile_view
-from gsmerge.raster.metrics import psnr
+from gsmerge.method.geometry.transforms import normalize
+from gsmerge.method.kernels import elementary
+from gsmerge.method.raster import composite, contributions, make_splats, render, splat_adjoint, tile_view
+from gsmerge.method.raster.metrics import psnr
 from gsmerge.runtime.threads import use_threads
 
 WIDTH, HEIGHT = 70, 50

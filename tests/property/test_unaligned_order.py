@@ -14,11 +14,11 @@ from scipy.spatial import cKDTree
 from sweeps import sweep
 
 from gsmerge import Scene, compact
-from gsmerge.geometry.pooling import scene_members
+from gsmerge.method.geometry.pooling import scene_members
+from gsmerge.method.stages.assign import find_owners, owner_pixels
+from gsmerge.method.stages.encode import member_rows
+from gsmerge.method.stages.segment import SegmentOptions, segment
 from gsmerge.prepare.true_pixels import with_pixels
-from gsmerge.stages.assign import find_owners, owner_pixels
-from gsmerge.stages.encode import member_rows
-from gsmerge.stages.segment import SegmentOptions, segment
 from gsmerge.types import Groups
 
 FEW = settings(max_examples=3, deadline=None, derandomize=True)

@@ -10,7 +10,7 @@ import scenes
 import unaligned_scenes
 
 from gsmerge import Scene, compact
-from gsmerge.geometry.pooling import scene_members
+from gsmerge.method.geometry.pooling import scene_members
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +47,7 @@ def test_many_gaussians_drawn_one_view_at_a_time_give_the_same_bits(
 ) -> None:
     actual = []
     for many in (0, 10**9):
-        monkeypatch.setattr("gsmerge.raster.images.ONE_AT_A_TIME", many)
+        monkeypatch.setattr("gsmerge.method.raster.images.ONE_AT_A_TIME", many)
         unaligned = unaligned_scenes.without_order(scene)
         actual.append(compact(unaligned, fit="none", superpixels="10%").gaussians)
     assert scenes.identical(actual[0], actual[1])

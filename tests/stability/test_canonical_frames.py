@@ -10,8 +10,8 @@ import scenes
 from sweeps import sweep
 
 from gsmerge import Scene
-from gsmerge.geometry.frame import scene_frame
-from gsmerge.geometry.pooling import scene_members
+from gsmerge.method.geometry.frame import scene_frame
+from gsmerge.method.geometry.pooling import scene_members
 
 UTM = np.array([4e5, 5e6, 120.0])
 

@@ -13,9 +13,9 @@ from sweeps import sweep
 from unaligned_scenes import shuffled
 
 import gsmerge
-from gsmerge.kernels import elementary
-from gsmerge.networks.checkpoint import IN_PACKAGE
-from gsmerge.networks.options import Bounds
+from gsmerge.method.kernels import elementary
+from gsmerge.method.networks.checkpoint import IN_PACKAGE
+from gsmerge.method.networks.options import Bounds
 from gsmerge.types import SH_C0
 
 PLAIN = {"fit": "none", "match": "none", "superpixels": 100, "poses": "fixed"}

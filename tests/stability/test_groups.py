@@ -11,10 +11,10 @@ import scenes
 from sweeps import sweep
 
 from gsmerge import Gaussians, Scene
-from gsmerge.geometry.pooling import feature_to_gaussians, scene_members
-from gsmerge.geometry.transforms import covariances, project, quat_to_rotmat
-from gsmerge.kernels import elementary
-from gsmerge.stages.encode import encode
+from gsmerge.method.geometry.pooling import feature_to_gaussians, scene_members
+from gsmerge.method.geometry.transforms import covariances, project, quat_to_rotmat
+from gsmerge.method.kernels import elementary
+from gsmerge.method.stages.encode import encode
 from gsmerge.types import FeatureGaussians, Groups
 
 compacted = partial(scenes.compacted, poses="fixed")

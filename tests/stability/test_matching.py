@@ -8,10 +8,10 @@ import scenes
 from sweeps import sweep
 
 from gsmerge import Cameras
-from gsmerge.geometry.pooling import feature_to_gaussians
+from gsmerge.method.geometry.pooling import feature_to_gaussians
+from gsmerge.method.stages.match import match
+from gsmerge.method.stages.merge import merge
 from gsmerge.settings.stages import MatchOptions
-from gsmerge.stages.match import match
-from gsmerge.stages.merge import merge
 from gsmerge.types import FeatureGaussians
 
 SIZE = 0.05

@@ -10,8 +10,8 @@ import scenes
 from sweeps import sweep
 
 from gsmerge import Cameras, Scene
-from gsmerge.geometry.views import concat_cameras
-from gsmerge.kernels import elementary
+from gsmerge.method.geometry.views import concat_cameras
+from gsmerge.method.kernels import elementary
 
 
 @pytest.fixture(scope="module")

@@ -13,8 +13,8 @@ from messages import names, noted
 from sweeps import sweep
 
 from gsmerge import Compactor, CompactResult, Gaussians, Scene, compact, render
-from gsmerge.geometry.transforms import rgb_to_sh0, sh0_to_rgb
-from gsmerge.kernels import elementary
+from gsmerge.method.geometry.transforms import rgb_to_sh0, sh0_to_rgb
+from gsmerge.method.kernels import elementary
 from gsmerge.prepare.prepare_scene import prepare
 from gsmerge.settings.stages import PrepareOptions
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from messages import refuses
 
 from gsmerge import Cameras, Gaussians
-from gsmerge.raster import composite, contributions, make_splats, render, splat_adjoint, tile_view
+from gsmerge.method.raster import composite, contributions, make_splats, render, splat_adjoint, tile_view
 
 EXTREMES = [0.0, 1e-30, 1e-8, 0.01, 0.0100001, 0.5, 1.0, 3.0, 1e3, 1e8, 1e20, 1e30]
 

@@ -11,7 +11,7 @@ import scenes
 from sweeps import sweep
 
 from gsmerge import Gaussians, Scene
-from gsmerge.geometry.views import concat_cameras
+from gsmerge.method.geometry.views import concat_cameras
 from gsmerge.scoring.fog import HAZE, measure_fog
 from gsmerge.types import Pixels
 

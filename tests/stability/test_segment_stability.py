@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from segmentation_scores import DENSITIES, count_at, photos, proxy_psnr, splat_psnr
 
-from gsmerge.kernels.superpixels.regions import pad_labels, refine, region_rows
+from gsmerge.method.kernels.superpixels.regions import pad_labels, refine, region_rows
+from gsmerge.method.stages.segment import SegmentOptions, segment
+from gsmerge.method.stages.superpixels import superpixels
 from gsmerge.runtime.threads import use_threads
 from gsmerge.settings.stages import SEGMENTATIONS
-from gsmerge.stages.segment import SegmentOptions, segment
-from gsmerge.stages.superpixels import superpixels
 
 
 @pytest.mark.parametrize("segmentation", SEGMENTATIONS)

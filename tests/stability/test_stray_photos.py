@@ -13,9 +13,9 @@ from messages import noted
 from sweeps import sweep
 
 from gsmerge import CompactResult, Gaussians, Scene, compact
-from gsmerge.compare.view_pictures import show_views
-from gsmerge.facts.pictures import ROW_COLORS
-from gsmerge.geometry.frame import canonicalise
+from gsmerge.method.compare.view_pictures import show_views
+from gsmerge.method.facts.pictures import ROW_COLORS
+from gsmerge.method.geometry.frame import canonicalise
 from gsmerge.prepare.compare_photos import compare_photos, find_matching_views
 from gsmerge.types import PicturedScene
 

@@ -13,7 +13,7 @@ from scenes import arc, make_scene, move, room
 
 from gsmerge import Gaussians, Scene, SceneError, compact_tensors, integrations
 from gsmerge.arrays import as_array
-from gsmerge.geometry.transforms import covariances, multiply_quats, rgb_to_sh0, rotmat_to_quat, sh0_to_rgb
+from gsmerge.method.geometry.transforms import covariances, multiply_quats, rgb_to_sh0, rotmat_to_quat, sh0_to_rgb
 
 torch = pytest.importorskip("torch", reason="torch is not installed")
 

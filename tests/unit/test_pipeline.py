@@ -8,12 +8,12 @@ import pytest
 import scenes
 
 from gsmerge import Scene, compact
-from gsmerge.facts.pictures import PHOTOS, ROW_COLORS
-from gsmerge.kernels import elementary
-from gsmerge.raster.photos import scene_photos, scene_pictures, score_photos
+from gsmerge.method.facts.pictures import PHOTOS, ROW_COLORS
+from gsmerge.method.kernels import elementary
+from gsmerge.method.raster.photos import scene_photos, scene_pictures, score_photos
+from gsmerge.method.stages.prune import ROUNDING
 from gsmerge.runtime.record import STAGES
 from gsmerge.settings.stages import SEGMENTATIONS
-from gsmerge.stages.prune import ROUNDING
 
 UNUSUAL = ("partition", "curve", "reduce", "refine", "cover", "choose", "join")
 USUAL = [stage for stage in STAGES if stage not in UNUSUAL]

@@ -16,14 +16,14 @@ from scenes import psnr_of
 from gsmerge import CompactOptions, Scene, compact
 from gsmerge.counts.search import MAX_BUILDS, add_target
 from gsmerge.errors import UsageError
-from gsmerge.facts.agreement import Agreement
-from gsmerge.facts.scene_size import SceneSize, measure_size
-from gsmerge.fit import Fitted
-from gsmerge.geometry.frame import canonicalise
-from gsmerge.geometry.views import REPORT_VIEWS
 from gsmerge.jobs.estimate import estimate
-from gsmerge.networks.checkpoint import IN_PACKAGE
-from gsmerge.pipelines.plan import Plan
+from gsmerge.method.facts.agreement import Agreement
+from gsmerge.method.facts.scene_size import SceneSize, measure_size
+from gsmerge.method.fit import Fitted
+from gsmerge.method.geometry.frame import canonicalise
+from gsmerge.method.geometry.views import REPORT_VIEWS
+from gsmerge.method.networks.checkpoint import IN_PACKAGE
+from gsmerge.method.pipelines.plan import Plan
 from gsmerge.plan.counts import FIDELITY_LOSS, FIDELITY_PSNR, resolve_budget
 from gsmerge.plan.efforts import EFFORTS
 from gsmerge.plan.fit import steps_for

@@ -11,20 +11,17 @@ import scenes
 import unaligned_scenes
 
 from gsmerge import Cameras, CompactOptions, Scene, compact, render
-from gsmerge.facts.scene_size import measure_size
-from gsmerge.fit import Fitted
-from gsmerge.fit.outside import STEP_BACK_HIGH, STEP_BACK_LOW, outside_cameras
-from gsmerge.fit.report import FitReport
-from gsmerge.geometry.transforms import camera_centres
 from gsmerge.jobs.estimate import estimate
-from gsmerge.pipelines.bare_rows import BARE_ROWS
-from gsmerge.pipelines.build import build
-from gsmerge.pipelines.pixel_rows import PIXEL_ROWS
-from gsmerge.plan.make_plan import make_plan, plan_scene
-from gsmerge.prepare.prepare_scene import prepare
-from gsmerge.raster.metrics import psnr
-from gsmerge.types import Decoded, Gaussians, Region
-from gsmerge.viewpoints.place_cameras import (
+from gsmerge.method.facts.scene_size import measure_size
+from gsmerge.method.fit import Fitted
+from gsmerge.method.fit.outside import STEP_BACK_HIGH, STEP_BACK_LOW, outside_cameras
+from gsmerge.method.fit.report import FitReport
+from gsmerge.method.geometry.transforms import camera_centres
+from gsmerge.method.pipelines.bare_rows import BARE_ROWS
+from gsmerge.method.pipelines.build import build
+from gsmerge.method.pipelines.pixel_rows import PIXEL_ROWS
+from gsmerge.method.raster.metrics import psnr
+from gsmerge.method.viewpoints.place_cameras import (
     FEW_RENDERED_VIEWS,
     MOST_OUTSIDE,
     OUTSIDE_SHARE,
@@ -32,6 +29,9 @@ from gsmerge.viewpoints.place_cameras import (
     draw_around,
     draw_pictures,
 )
+from gsmerge.plan.make_plan import make_plan, plan_scene
+from gsmerge.prepare.prepare_scene import prepare
+from gsmerge.types import Decoded, Gaussians, Region
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +86,7 @@ def test_a_refused_fit_leaves_all_that_was_merged(scene: Scene, monkeypatch: pyt
         report = FitReport("none", False, 1, math.nan, math.nan, "worse")
         return Fitted(decoded.gaussians[:10], around.cameras, report)
 
-    monkeypatch.setattr("gsmerge.stages.fit_pairs.fit_scene", fail)
+    monkeypatch.setattr("gsmerge.method.stages.fit_pairs.fit_scene", fail)
     assert len(compact(scene, budget=300).gaussians) == 300
 
 

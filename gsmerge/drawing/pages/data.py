@@ -10,17 +10,17 @@ import numpy as np
 from gsmerge.drawing.camera_path import outside_camera
 from gsmerge.drawing.pages.splats import MAX_GAUSSIANS, highest_degree, pack_splats
 from gsmerge.drawing.preview import OUTSIDE_VIEW, BytePicture, lay_on_chequer, to_picture
-from gsmerge.facts.agreement import Agreement
 from gsmerge.frozen import dataclass, replace
-from gsmerge.geometry.frame import Frame, scene_frame
-from gsmerge.geometry.transforms import middle_depth
-from gsmerge.geometry.views import even_views
 from gsmerge.io.photo_files import encode_picture, photo_array
+from gsmerge.method.facts.agreement import Agreement
+from gsmerge.method.geometry.frame import Frame, scene_frame
+from gsmerge.method.geometry.transforms import middle_depth
+from gsmerge.method.geometry.views import even_views
+from gsmerge.method.raster import render
+from gsmerge.method.raster.metrics import is_worse
+from gsmerge.method.raster.photos import COVERED_TRANSMITTANCE, NEAR_PLANE, WHOLE_SHARE
 from gsmerge.prepare.confirm_depths import confirm_depths
 from gsmerge.prepare.fill_holes import large_parts
-from gsmerge.raster import render
-from gsmerge.raster.metrics import is_worse
-from gsmerge.raster.photos import COVERED_TRANSMITTANCE, NEAR_PLANE, WHOLE_SHARE
 from gsmerge.runtime.record import Progress
 from gsmerge.runtime.threads import use_threads
 from gsmerge.scoring.evaluate import INPUT, EvaluateOptions, Evaluation, Quality, ResultScores, evaluate

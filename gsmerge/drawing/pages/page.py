@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gsmerge.drawing.pages.data import PageView, ViewData
-from gsmerge.facts.pictures import PHOTOS, ROW_COLORS
 from gsmerge.frozen import dataclass
+from gsmerge.method.facts.pictures import PHOTOS, ROW_COLORS
 from gsmerge.runtime.memory import human_bytes, human_share
 from gsmerge.types import Cameras
 from gsmerge.version import __version__

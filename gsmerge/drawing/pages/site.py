@@ -10,15 +10,15 @@ from gsmerge.drawing.camera_path import median_camera
 from gsmerge.drawing.pages.data import encode_still
 from gsmerge.drawing.pages.page import VIEWER, base64_text, data_uri, describe_gain, page_camera, render_template
 from gsmerge.drawing.preview import to_picture
-from gsmerge.geometry.transforms import middle_depth
-from gsmerge.geometry.views import even_views
 from gsmerge.io.atomic import AddOutput
 from gsmerge.io.formats.rows import read_expected_scores
 from gsmerge.io.formats.sog import sog_bytes
 from gsmerge.io.formats.table import Contents
-from gsmerge.raster import render
+from gsmerge.method.geometry.transforms import middle_depth
+from gsmerge.method.geometry.views import even_views
+from gsmerge.method.raster import render
+from gsmerge.method.viewpoints.place_cameras import place_viewpoints
 from gsmerge.types import Cameras, Gaussians
-from gsmerge.viewpoints.place_cameras import place_viewpoints
 
 # Content security policy: only the page's own scripts run. The script of the 3D viewer Spark starts a worker, and loads
 # data: addresses that it holds itself

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from gsmerge.io.formats import spz
-from gsmerge.kernels.page_rows import LOOKS, pack_looks, pack_pixels
-from gsmerge.raster.photos import LEAST_OPACITY
+from gsmerge.method.kernels.page_rows import LOOKS, pack_looks, pack_pixels
+from gsmerge.method.raster.photos import LEAST_OPACITY
 from gsmerge.types import SH_C0, Cameras, Gaussians
 
 MAX_GAUSSIANS = 2_000_000  # larger scenes have only stills, since a page gets too large and loads too slowly

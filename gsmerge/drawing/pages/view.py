@@ -19,13 +19,13 @@ from gsmerge.io.first_bytes import may_be_replaced
 from gsmerge.io.formats.ply import file_bytes
 from gsmerge.io.formats.read_gaussians import GaussianFile, read_gaussians
 from gsmerge.io.formats.rows import read_expected_scores
+from gsmerge.method.viewpoints.place_cameras import add_views
 from gsmerge.reading.input import as_scene
 from gsmerge.reading.scene_files import find_scene_files, scene_title
 from gsmerge.runtime.arguments import check_arguments
 from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.record import Progress, record_run
 from gsmerge.types import Gaussians, HasGaussians, Scene, StrPath, Views, own_gaussians
-from gsmerge.viewpoints.place_cameras import add_views
 
 NOTEBOOK_HEIGHT = 820  # height of a page in a notebook, pixels
 

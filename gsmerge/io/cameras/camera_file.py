@@ -11,10 +11,10 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.frozen import dataclass, field, replace
-from gsmerge.geometry.transforms import Similarity, pose_changes
 from gsmerge.io.bounds import MAX_VIEWS, check_image_size
 from gsmerge.io.photo_files import PhotoArrays, PhotoTransform, Size, change_photos, photo_size, same_shape
-from gsmerge.kernels.matrices import determinant, invert, matmul
+from gsmerge.method.geometry.transforms import Similarity, pose_changes
+from gsmerge.method.kernels.matrices import determinant, invert, matmul
 from gsmerge.runtime.arguments import check_arguments
 from gsmerge.settings.reading import Order
 from gsmerge.types import Cameras, StrPath

@@ -13,11 +13,11 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.geometry.transforms import rotation_entries
 from gsmerge.io.bounds import MAX_MODEL_BYTES, MAX_VIEWS, read_lines
 from gsmerge.io.cameras.camera_file import StoredView, check_camera_count, make_lens, make_pinhole
 from gsmerge.io.cameras.camera_source import CameraSource, StoredCameras
 from gsmerge.io.first_bytes import read_start
+from gsmerge.method.geometry.transforms import rotation_entries
 
 # Camera model -> number of its parameters, in the order of COLMAP's ids. The first parameters of every model are one or
 # two focal lengths and the principal point

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from gsmerge.geometry.transforms import Similarity
 from gsmerge.io.bounds import read_json
 from gsmerge.io.cameras.camera_file import MAX_NUMBER, make_similarity
 from gsmerge.io.cameras.camera_source import number_errors, to_array, to_number
-from gsmerge.kernels.matrices import invert, matmul
+from gsmerge.method.geometry.transforms import Similarity
+from gsmerge.method.kernels.matrices import invert, matmul
 
 DATAPARSER = "dataparser_transforms.json"  # name of nerfstudio's file with its map
 # Pattern of an offset: three numbers that stand alone in a line, an element or brackets

@@ -29,7 +29,7 @@ from gsmerge.io.cameras.camera_file import C2W_OPENCV, MAX_NORMALISED_FOCAL, ORD
 from gsmerge.io.cameras.camera_source import CameraSource, StoredCameras
 from gsmerge.io.image_names import natural_key
 from gsmerge.io.photo_files import PhotoArrays
-from gsmerge.kernels.matrices import invert
+from gsmerge.method.kernels.matrices import invert
 from gsmerge.runtime.threads import quiet_warnings
 
 # Names of arrays in the files of several programs. Names in files of Lyra 2 end with one of the words of ``_LYRA``

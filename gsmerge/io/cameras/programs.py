@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.geometry.transforms import mean_pose_frame
 from gsmerge.io.bounds import MAX_VIEWS, read_json, read_text
 from gsmerge.io.cameras.camera_file import (
     CENTRED_PX,
@@ -26,6 +25,7 @@ from gsmerge.io.cameras.camera_source import CameraSource, StoredCameras, number
 from gsmerge.io.cameras.view_layout import Entry
 from gsmerge.io.formats.table import PLY, find_format
 from gsmerge.io.image_names import natural_key, natural_order
+from gsmerge.method.geometry.transforms import mean_pose_frame
 
 FRAMES_FILE = "input_frame_idx.txt"  # of Long-LRM; lists the frames that the model saw
 SHARP = "SHARP"  # ``source`` of the camera in SHARP's ``.ply``

@@ -16,7 +16,6 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.frozen import dataclass, field
-from gsmerge.geometry.transforms import motion_matrices
 from gsmerge.io.cameras.camera_file import Lens, StoredView, check_camera_count, make_lens, make_pinhole
 from gsmerge.io.cameras.camera_source import (
     CameraSource,
@@ -29,7 +28,8 @@ from gsmerge.io.cameras.camera_source import (
 )
 from gsmerge.io.image_names import find_image
 from gsmerge.io.photo_files import Size, image_size
-from gsmerge.kernels.elementary import cos, sin
+from gsmerge.method.geometry.transforms import motion_matrices
+from gsmerge.method.kernels.elementary import cos, sin
 
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")  # the order of nerfstudio's "distortion_params"
 _COEFFICIENTS = (*_DISTORTION, "k5", "k6")
@@ -100,7 +100,7 @@ class RotationAndShift:
         shift: Key of the last column, which is the camera's centre if poses are camera-to-world.
         to_matrix: Function that makes the rotation ``[3,3]`` from the numbers under ``rotation``:
             :func:`rotation_of_matrix`, :func:`rotation_of_vector`, or for quaternions wxyz
-            :func:`gsmerge.geometry.transforms.quat_to_rotmat`.
+            :func:`gsmerge.method.geometry.transforms.quat_to_rotmat`.
     """
 
     rotation: str

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from gsmerge.geometry.transforms import camera_centres, lower_median, normalize
 from gsmerge.io.cameras.camera_file import CENTRED_PX
+from gsmerge.method.geometry.transforms import camera_centres, lower_median, normalize
 from gsmerge.types import Cameras
 
 ENDING = ".cameras.json"

@@ -17,10 +17,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.geometry.transforms import rgb_to_sh0
 from gsmerge.io.formats import rows as arrays
 from gsmerge.io.formats.rows import PACKED
-from gsmerge.kernels.elementary import log, log1p
+from gsmerge.method.geometry.transforms import rgb_to_sh0
+from gsmerge.method.kernels.elementary import log, log1p
 
 if TYPE_CHECKING:
     from gsmerge.io.formats.ply import Element

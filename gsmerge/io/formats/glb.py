@@ -20,7 +20,6 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.frozen import dataclass, replace
-from gsmerge.geometry.transforms import quat_to_rotmat
 from gsmerge.io.bounds import ReadBudget, check_whole, parse_json, read_budget, read_errors
 from gsmerge.io.cameras.viewer_cameras import order_views, vertical_field
 from gsmerge.io.formats.rows import (
@@ -36,8 +35,9 @@ from gsmerge.io.formats.rows import (
 )
 from gsmerge.io.formats.spz import read_packed
 from gsmerge.io.formats.table import PLAIN, Contents
-from gsmerge.kernels.elementary import exp, log, power
-from gsmerge.kernels.matrices import matmul
+from gsmerge.method.geometry.transforms import quat_to_rotmat
+from gsmerge.method.kernels.elementary import exp, log, power
+from gsmerge.method.kernels.matrices import matmul
 from gsmerge.types import NO_CAMERAS, Gaussians, number_views
 
 MAX_DEGREE = 3  # of harmonics, the highest of the extension

@@ -26,7 +26,7 @@ from gsmerge.io.cameras.camera_file import StoredView
 from gsmerge.io.cameras.camera_source import CameraSource, StoredCameras
 from gsmerge.io.formats.rows import Columns, Packed, StoredRows, check_gaussian_count, copied_comments, to_stored
 from gsmerge.io.tensor_file import read_tensors
-from gsmerge.kernels.elementary import log
+from gsmerge.method.kernels.elementary import log
 from gsmerge.types import Cameras, Gaussians, Scene, StrPath
 from gsmerge.version import __version__
 

@@ -26,7 +26,7 @@ from gsmerge.io.formats import rows as arrays
 from gsmerge.io.formats.columns import check_columns
 from gsmerge.io.formats.rows import FileRows, truncated
 from gsmerge.io.image_names import IMAGE_SUFFIXES, OTHER_SUFFIXES
-from gsmerge.kernels.elementary import log, log1p
+from gsmerge.method.kernels.elementary import log, log1p
 from gsmerge.runtime.plugins import LazyFunction
 from gsmerge.runtime.threads import quiet_warnings
 from gsmerge.types import Gaussians

@@ -10,14 +10,14 @@ import numpy as np
 
 from gsmerge.errors import Doubt, Note, SceneError, count_words
 from gsmerge.frozen import dataclass
-from gsmerge.geometry.transforms import lower_median, rgb_to_sh0
 from gsmerge.io.formats import ply
 from gsmerge.io.formats import rows as arrays
 from gsmerge.io.formats.rows import MIP, StoredRows, render_mode
 from gsmerge.io.formats.table import META, PLY, READ_ENDINGS, find_format
 from gsmerge.io.formats.units import LINEAR_NOTE, ColorUnits, are_scales_linear, choose_colors, with_linear_scales
-from gsmerge.kernels.elementary import exp
-from gsmerge.kernels.stored_rows import convert_rows
+from gsmerge.method.geometry.transforms import lower_median, rgb_to_sh0
+from gsmerge.method.kernels.elementary import exp
+from gsmerge.method.kernels.stored_rows import convert_rows
 from gsmerge.runtime.arguments import check_arguments
 from gsmerge.runtime.memory import free_pages, make_array
 from gsmerge.runtime.threads import parallel_map

@@ -12,7 +12,8 @@ import numpy as np
 from gsmerge.arrays import Array, as_array
 from gsmerge.errors import Doubt, SceneError
 from gsmerge.frozen import dataclass, fields, replace
-from gsmerge.geometry.transforms import (
+from gsmerge.io.bounds import ReadBudget, read_errors
+from gsmerge.method.geometry.transforms import (
     apply_harmonics_rotation,
     harmonics_rotation,
     morton_codes,
@@ -20,9 +21,8 @@ from gsmerge.geometry.transforms import (
     rotmat_to_quat,
     sh0_to_rgb,
 )
-from gsmerge.io.bounds import ReadBudget, read_errors
-from gsmerge.kernels.elementary import log
-from gsmerge.kernels.matrices import matmul
+from gsmerge.method.kernels.elementary import log
+from gsmerge.method.kernels.matrices import matmul
 from gsmerge.types import Gaussians
 
 MAX_POSITION = 1e13  # no scene is larger, in any unit; squares and sums of such positions are finite in float32

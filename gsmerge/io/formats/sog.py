@@ -39,7 +39,7 @@ from gsmerge.io.bounds import (
 )
 from gsmerge.io.formats import rows as arrays
 from gsmerge.io.formats.table import META, PLAIN, Contents
-from gsmerge.kernels.elementary import expm1, log1p
+from gsmerge.method.kernels.elementary import expm1, log1p
 from gsmerge.types import Gaussians
 
 MAX_DEGREE = 3  # of harmonics, the highest of the format

@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.geometry.transforms import rgb_to_sh0
 from gsmerge.io.bounds import check_file, read_errors
 from gsmerge.io.formats.rows import EXPORT_AGAIN, Columns, Packed, StoredRows, column_blocks, to_bytes, to_stored
 from gsmerge.io.formats.table import PLAIN, Contents
-from gsmerge.kernels.elementary import exp, log
+from gsmerge.method.geometry.transforms import rgb_to_sh0
+from gsmerge.method.kernels.elementary import exp, log
 from gsmerge.types import Gaussians
 
 MAX_DEGREE = 0  # of harmonics, since the format has only colours

@@ -27,10 +27,10 @@ import numpy as np
 from gsmerge.arrays import as_array, to_float32
 from gsmerge.errors import SceneError
 from gsmerge.frozen import astuple, dataclass, replace
-from gsmerge.geometry.transforms import rgb_to_sh0
 from gsmerge.io.bounds import ReadBudget, check_file, read_errors
 from gsmerge.io.formats import rows as arrays
 from gsmerge.io.formats.table import PLAIN, Contents
+from gsmerge.method.geometry.transforms import rgb_to_sh0
 from gsmerge.types import SH_C0, Gaussians, StrPath
 
 # Default version and largest degree of harmonics of written files. Spark 2.2 does not read version 4 of the format, and

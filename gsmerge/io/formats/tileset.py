@@ -23,8 +23,8 @@ from gsmerge.io.formats.glb import COLOR_SPACE, COMPRESSED, HALF_TURN, HARMONICS
 from gsmerge.io.formats.rows import StoredRows
 from gsmerge.io.formats.spz import MAX_DEGREE, spz_bytes
 from gsmerge.io.formats.table import TILESET, Contents
-from gsmerge.kernels.elementary import cos, sin
-from gsmerge.kernels.matrices import matmul
+from gsmerge.method.kernels.elementary import cos, sin
+from gsmerge.method.kernels.matrices import matmul
 from gsmerge.settings.files import parse_place
 from gsmerge.types import Cameras, Gaussians
 

@@ -13,10 +13,10 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.frozen import dataclass, replace
-from gsmerge.geometry.transforms import median, quantiles
 from gsmerge.io.formats import ply
 from gsmerge.io.formats import rows as arrays
-from gsmerge.kernels.elementary import log
+from gsmerge.method.geometry.transforms import median, quantiles
+from gsmerge.method.kernels.elementary import log
 from gsmerge.runtime.memory import gather
 from gsmerge.settings.reading import ColorChoice, ScaleChoice
 

@@ -11,11 +11,11 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from gsmerge.arrays import distinct
-from gsmerge.geometry.transforms import medians
 from gsmerge.io.atomic import AddOutput, atomic_output
 from gsmerge.io.formats import ply
 from gsmerge.io.formats.read_gaussians import read_gaussians
 from gsmerge.io.formats.table import OUTPUT_FORMATS, PLY, Contents, output_format
+from gsmerge.method.geometry.transforms import medians
 from gsmerge.runtime.arguments import check_arguments
 from gsmerge.types import Gaussians, StrPath
 

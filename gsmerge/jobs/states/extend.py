@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 
 from gsmerge.errors import SceneError, split_notes
-from gsmerge.facts.agreement import CHANCE_ERRORS, NORMAL_SAMPLES
-from gsmerge.facts.prepared import Prepared
 from gsmerge.frozen import asdict, dataclass, replace
-from gsmerge.geometry.transforms import camera_centres, camera_distances
-from gsmerge.geometry.views import camera_kinds, concat_cameras, in_float64, resize_cameras, subset
 from gsmerge.io.photo_files import photo_array
-from gsmerge.raster.photos import counting_pixels, shrink_pictures
+from gsmerge.method.facts.agreement import CHANCE_ERRORS, NORMAL_SAMPLES
+from gsmerge.method.facts.prepared import Prepared
+from gsmerge.method.geometry.transforms import camera_centres, camera_distances
+from gsmerge.method.geometry.views import camera_kinds, concat_cameras, in_float64, resize_cameras, subset
+from gsmerge.method.raster.photos import counting_pixels, shrink_pictures
 from gsmerge.reading.alignment import check_cameras
 from gsmerge.results.outputs import join_gaussians
 from gsmerge.run import compact_prepared, plan_run

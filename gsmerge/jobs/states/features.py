@@ -14,9 +14,6 @@ import numpy as np
 
 from gsmerge.errors import UsageError
 from gsmerge.frozen import dataclass, fields, replace
-from gsmerge.geometry.frame import Frame
-from gsmerge.geometry.pooling import Members, feature_to_gaussians, gaussian_members
-from gsmerge.geometry.views import concat_cameras, resize_cameras
 from gsmerge.io.formats.gsm import NUM_HIGHER
 from gsmerge.jobs.states.extend import (
     NOT_COMPARED,
@@ -26,13 +23,21 @@ from gsmerge.jobs.states.extend import (
     compare_worlds,
     refuse_other_world,
 )
-from gsmerge.kernels.gaussians.cluster import connected_components
-from gsmerge.networks.apply import NetworkContext, decode_gaussians
-from gsmerge.networks.checkpoint import Checkpoint
-from gsmerge.networks.cross_view_stats import cross_view_stats
-from gsmerge.networks.tokens import GroupFeatures, describe_features, make_group_features
-from gsmerge.networks.weights import NetworkWeights
-from gsmerge.pipelines.pixel_rows import encode_groups
+from gsmerge.method.geometry.frame import Frame
+from gsmerge.method.geometry.pooling import Members, feature_to_gaussians, gaussian_members
+from gsmerge.method.geometry.views import concat_cameras, resize_cameras
+from gsmerge.method.kernels.gaussians.cluster import connected_components
+from gsmerge.method.networks.apply import NetworkContext, decode_gaussians
+from gsmerge.method.networks.checkpoint import Checkpoint
+from gsmerge.method.networks.cross_view_stats import cross_view_stats
+from gsmerge.method.networks.tokens import GroupFeatures, describe_features, make_group_features
+from gsmerge.method.networks.weights import NetworkWeights
+from gsmerge.method.pipelines.pixel_rows import encode_groups
+from gsmerge.method.stages.decode import counts_by_saliency, group_saliency, repeat_groups
+from gsmerge.method.stages.match import match
+from gsmerge.method.stages.merge import merge
+from gsmerge.method.stages.segment import segment_scene
+from gsmerge.method.stages.superpixels import scene_saliency
 from gsmerge.plan.make_plan import make_plan
 from gsmerge.prepare.prepare_scene import prepare
 from gsmerge.prepare.steps import without
@@ -41,11 +46,6 @@ from gsmerge.runtime.threads import use_threads
 from gsmerge.settings.compact import ONE_PIECE, CompactOptions
 from gsmerge.settings.extend import ExtendOptions
 from gsmerge.settings.stages import MIXED, DecodeOptions, MatchOptions
-from gsmerge.stages.decode import counts_by_saliency, group_saliency, repeat_groups
-from gsmerge.stages.match import match
-from gsmerge.stages.merge import merge
-from gsmerge.stages.segment import segment_scene
-from gsmerge.stages.superpixels import scene_saliency
 from gsmerge.types import Cameras, FeatureGaussians, Gaussians, Matches, Pixels, Scene
 from gsmerge.version import __version__
 

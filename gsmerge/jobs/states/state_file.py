@@ -10,7 +10,6 @@ import numpy as np
 
 from gsmerge.errors import count_words
 from gsmerge.frozen import asdict, dataclass, fields, replace
-from gsmerge.geometry.frame import Frame
 from gsmerge.io.cameras.camera_file import MAX_NUMBER, check_camera, check_size
 from gsmerge.io.formats.gsm import (
     FEATURES,
@@ -25,7 +24,8 @@ from gsmerge.io.formats.gsm import (
     write_scene,
 )
 from gsmerge.jobs.states.features import FeatureState, ViewSamples
-from gsmerge.networks.options import CORRECTED, GROUP_COLUMNS
+from gsmerge.method.geometry.frame import Frame
+from gsmerge.method.networks.options import CORRECTED, GROUP_COLUMNS
 from gsmerge.reading.checkpoint import build_networks
 from gsmerge.reading.read_scene import load_scene
 from gsmerge.types import FeatureGaussians, Gaussians, Scene, StrPath

@@ -19,11 +19,11 @@ import numpy as np
 
 from gsmerge.errors import Note, SceneError, attempt
 from gsmerge.frozen import dataclass, replace
-from gsmerge.geometry.transforms import IDENTITY, Similarity, median
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.formats.read_gaussians import GaussianFile
 from gsmerge.io.image_names import natural_key
 from gsmerge.io.photo_files import NO_IMAGES, PhotoArrays, PhotoTransform, as_floats, photo_size
+from gsmerge.method.geometry.transforms import IDENTITY, Similarity, median
 from gsmerge.reading.alignment.conventions import move_cameras, other_conventions
 from gsmerge.reading.alignment.dropped_rows import estimate_cameras, follow_rows
 from gsmerge.reading.alignment.explain import refuse_other_cameras

@@ -15,8 +15,8 @@ import numpy as np
 from gsmerge.frozen import dataclass, replace
 from gsmerge.io.cameras.camera_file import make_pinhole
 from gsmerge.io.photo_files import Size
-from gsmerge.kernels.elementary import log
-from gsmerge.kernels.matrices import matmul
+from gsmerge.method.kernels.elementary import log
+from gsmerge.method.kernels.matrices import matmul
 from gsmerge.reading.alignment.resection import (
     ALL_INTRINSICS,
     ONE_FOCAL,

@@ -14,7 +14,6 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.frozen import dataclass, replace
-from gsmerge.geometry.transforms import camera_depths, is_inside, project_points, robust_weights
 from gsmerge.io.cameras.camera_file import (
     CONVENTIONS,
     Convention,
@@ -24,7 +23,8 @@ from gsmerge.io.cameras.camera_file import (
     to_viewmats,
 )
 from gsmerge.io.photo_files import NO_IMAGES
-from gsmerge.kernels.matrices import invert, matmul, transform
+from gsmerge.method.geometry.transforms import camera_depths, is_inside, project_points, robust_weights
+from gsmerge.method.kernels.matrices import invert, matmul, transform
 from gsmerge.reading.alignment.frames import solve_pose
 from gsmerge.reading.alignment.score import (
     Correspondences,

@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 
 from gsmerge.frozen import dataclass, replace
-from gsmerge.geometry.transforms import median
 from gsmerge.io.cameras.camera_file import W2C_OPENCV, CameraFile, StoredView, make_camera_file
-from gsmerge.kernels.matrices import matmul
-from gsmerge.kernels.reproject import follow_pixels
+from gsmerge.method.geometry.transforms import median
+from gsmerge.method.kernels.matrices import matmul
+from gsmerge.method.kernels.reproject import follow_pixels
 from gsmerge.reading.alignment.calibration import calibrate
 from gsmerge.reading.alignment.layouts import ESTIMATED, Layout
 from gsmerge.reading.alignment.resection import projective_camera

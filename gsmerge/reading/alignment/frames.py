@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsmerge.geometry.transforms import (
+from gsmerge.method.geometry.transforms import (
     IDENTITY,
     Similarity,
     camera_centres,
@@ -21,8 +21,8 @@ from gsmerge.geometry.transforms import (
     medians,
     robust_weights,
 )
-from gsmerge.kernels.elementary import arccos
-from gsmerge.kernels.matrices import invert, matmul, solve_symmetric, transform
+from gsmerge.method.kernels.elementary import arccos
+from gsmerge.method.kernels.matrices import invert, matmul, solve_symmetric, transform
 from gsmerge.reading.alignment.resection import projection_errors, refine_poses, start_pose
 from gsmerge.reading.alignment.score import Correspondences
 from gsmerge.types import Cameras

@@ -10,10 +10,10 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.frozen import dataclass, replace
-from gsmerge.geometry.transforms import IDENTITY, Similarity
 from gsmerge.io.cameras.camera_file import MAX_NORMALISED_FOCAL, CameraFile, Convention, sizes_of, to_cameras
 from gsmerge.io.cameras.table import FFGS
 from gsmerge.io.photo_files import PhotoTransform, Size, resize_and_crop, resize_to, same_shape
+from gsmerge.method.geometry.transforms import IDENTITY, Similarity
 from gsmerge.reading.alignment.conventions import PosesInConvention, describe_convention
 from gsmerge.reading.alignment.layouts import ESTIMATED
 from gsmerge.types import Cameras

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from gsmerge.geometry.transforms import Damping, descend, median, medians, motion_matrices, robust_weights
-from gsmerge.kernels import reproject
-from gsmerge.kernels.matrices import eigh, matmul, solve
+from gsmerge.method.geometry.transforms import Damping, descend, median, medians, motion_matrices, robust_weights
+from gsmerge.method.kernels import reproject
+from gsmerge.method.kernels.matrices import eigh, matmul, solve
 
 POSE_DAMPING = Damping(steps=30, first=1e-3, decrease=0.1, increase=10.0, largest=1e8, min_gain=1e-10)
 # Numbers of intrinsics that are solved for: fx = fy; or fx and fy; or fx, fy, cx and cy

@@ -8,8 +8,8 @@ import sys
 import numpy as np
 
 from gsmerge.frozen import dataclass
-from gsmerge.geometry.transforms import lower_median
-from gsmerge.kernels import reproject
+from gsmerge.method.geometry.transforms import lower_median
+from gsmerge.method.kernels import reproject
 from gsmerge.reading.alignment.layouts import Layout, spread_step
 from gsmerge.runtime.memory import free_pages, gather
 from gsmerge.types import Cameras, Gaussians, Scene

@@ -9,10 +9,10 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.frozen import dataclass, replace
-from gsmerge.geometry.transforms import IDENTITY, Similarity, is_inside, project_points, sh0_to_rgb
 from gsmerge.io.cameras.camera_file import Convention
-from gsmerge.kernels.elementary import exp
-from gsmerge.kernels.matrices import invert, matmul
+from gsmerge.method.geometry.transforms import IDENTITY, Similarity, is_inside, project_points, sh0_to_rgb
+from gsmerge.method.kernels.elementary import exp
+from gsmerge.method.kernels.matrices import invert, matmul
 from gsmerge.reading.alignment.conventions import PosesInConvention, other_conventions
 from gsmerge.reading.alignment.frames import exporter_frames, quarter_turns
 from gsmerge.reading.alignment.grids import Grid, with_poses

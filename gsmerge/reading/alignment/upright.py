@@ -17,8 +17,8 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.frozen import dataclass, replace
-from gsmerge.geometry.transforms import Similarity, sh0_to_rgb
-from gsmerge.kernels.matrices import matmul
+from gsmerge.method.geometry.transforms import Similarity, sh0_to_rgb
+from gsmerge.method.kernels.matrices import matmul
 from gsmerge.reading.alignment.frames import UPRIGHT, ray_directions, solve_frame
 from gsmerge.reading.alignment.layouts import TRIMS
 from gsmerge.reading.alignment.score import AlignmentInput, Correspondences, pixel_errors, pixel_limit

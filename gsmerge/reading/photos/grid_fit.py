@@ -13,12 +13,12 @@ from typing import TypeVar
 
 import numpy as np
 
-from gsmerge.compare.offsets import correlate_parts
-from gsmerge.compare.similarity import stands_out
-from gsmerge.compare.view_pictures import ViewPictures
 from gsmerge.frozen import dataclass, replace
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.photo_files import WHOLE, Part, PhotoTransform, Size, cut_part, part_size, resize_and_crop, resize_to
+from gsmerge.method.compare.offsets import correlate_parts
+from gsmerge.method.compare.similarity import stands_out
+from gsmerge.method.compare.view_pictures import ViewPictures
 from gsmerge.reading.alignment import TRIMS
 
 

@@ -8,10 +8,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from gsmerge.compare.offsets import OFFSET_PIXELS
 from gsmerge.errors import Doubt, SceneError
 from gsmerge.frozen import dataclass
-from gsmerge.geometry.transforms import is_inside, project
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.image_names import find_image, match_masks
 from gsmerge.io.photo_files import (
@@ -27,7 +25,9 @@ from gsmerge.io.photo_files import (
     limit_size,
     same_shape,
 )
-from gsmerge.kernels.pictures import turn_picture
+from gsmerge.method.compare.offsets import OFFSET_PIXELS
+from gsmerge.method.geometry.transforms import is_inside, project
+from gsmerge.method.kernels.pictures import turn_picture
 from gsmerge.reading.photos.scene_photos import ScenePhotos, is_grey
 from gsmerge.reading.scene_files import SceneFiles
 from gsmerge.runtime.record import list_some

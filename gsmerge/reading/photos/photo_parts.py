@@ -10,12 +10,8 @@ from itertools import product
 
 import numpy as np
 
-from gsmerge.compare.assign_photos import Assigner, Assignment, Candidates
-from gsmerge.compare.offsets import OFFSET_PIXELS
-from gsmerge.compare.view_pictures import show_views
 from gsmerge.errors import SceneError, attempt
 from gsmerge.frozen import replace
-from gsmerge.geometry.views import pick_views
 from gsmerge.io.cameras.camera_file import CameraFile, sizes_of
 from gsmerge.io.photo_files import (
     ASPECT_TOLERANCE,
@@ -31,7 +27,11 @@ from gsmerge.io.photo_files import (
     resize_to,
     same_shape,
 )
-from gsmerge.kernels.pictures import count_bars
+from gsmerge.method.compare.assign_photos import Assigner, Assignment, Candidates
+from gsmerge.method.compare.offsets import OFFSET_PIXELS
+from gsmerge.method.compare.view_pictures import show_views
+from gsmerge.method.geometry.views import pick_views
+from gsmerge.method.kernels.pictures import count_bars
 from gsmerge.reading.photos.grid_fit import WHOLE_FIT, GridFit, PartFit, choose_fit
 from gsmerge.reading.photos.scene_photos import ScenePhotos
 from gsmerge.runtime.threads import parallel_map

@@ -1,7 +1,7 @@
 """Find and read the photos of a scene's views.
 
 Names and folders propose a file for each camera. The content of the photos decides which photo belongs to which view,
-and in which orientation (:mod:`gsmerge.compare.assign_photos`).
+and in which orientation (:mod:`gsmerge.method.compare.assign_photos`).
 """
 
 from __future__ import annotations
@@ -16,9 +16,6 @@ from typing import Any
 
 import numpy as np
 
-from gsmerge.compare.assign_photos import Assigner, Candidates, assign_photos
-from gsmerge.compare.offsets import OFFSET_PIXELS, correlate_parts
-from gsmerge.compare.view_pictures import ViewPictures, show_views
 from gsmerge.errors import Doubt, SceneError, attempt
 from gsmerge.frozen import dataclass, field, replace
 from gsmerge.io.cameras.camera_file import CameraFile, select_views, sizes_of
@@ -41,8 +38,11 @@ from gsmerge.io.photo_files import (
     part_size,
     same_shape,
 )
-from gsmerge.kernels.pictures import turn_picture
-from gsmerge.raster.photos import row_pictures
+from gsmerge.method.compare.assign_photos import Assigner, Candidates, assign_photos
+from gsmerge.method.compare.offsets import OFFSET_PIXELS, correlate_parts
+from gsmerge.method.compare.view_pictures import ViewPictures, show_views
+from gsmerge.method.kernels.pictures import turn_picture
+from gsmerge.method.raster.photos import row_pictures
 from gsmerge.reading.alignment import ESTIMATED
 from gsmerge.reading.photos.grid_fit import WHOLE_FIT, GridFit, PartFit, choose_fit, list_fits
 from gsmerge.reading.scene_files import SceneFiles, list_folders
@@ -74,7 +74,7 @@ class ScenePhotos:
     exact: bool = False  # True: names propose the files; False: their order does
     by_names: bool = False  # True: the folder was found by the names of its files
     paths: tuple[Path | None, ...] = ()  # the photo of each camera; None for a camera without a photo
-    turns: tuple[int, ...] = ()  # orientation of each photo, 0 to 7; see gsmerge.kernels.pictures.turn_picture
+    turns: tuple[int, ...] = ()  # orientation of each photo, 0 to 7; see gsmerge.method.kernels.pictures.turn_picture
     faults: tuple[str | None, ...] = ()  # for each camera, why its photo cannot be used; None for no fault
     # Size to which upright photos of several shapes are extended, see gsmerge.io.photo_files.extend_picture; None: all
     # have one shape
@@ -396,7 +396,7 @@ def _list_candidates(photos: ScenePhotos) -> Candidates:
 
 
 def assign_to_views(scene: Scene, photos: ScenePhotos, camera_file: CameraFile, *, read: bool) -> ScenePhotos:
-    """Assign files to the views of a scene; see :func:`gsmerge.compare.assign_photos.assign_photos`.
+    """Assign files to the views of a scene; see :func:`gsmerge.method.compare.assign_photos.assign_photos`.
 
     If ``read`` is True, the proposed photos are the photos of the scene. If False, small versions of files are read. A
     view gets no photo if its camera is only a guess, because cameras were estimated and the view has no Gaussians.

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from functools import partial
 
-from gsmerge.fit import FitOptions
 from gsmerge.io.formats.splat_transform import find_program
+from gsmerge.method.fit import FitOptions
 from gsmerge.plugin import Method, prepare, without
 from gsmerge.research.baselines import greedy, simple
 from gsmerge.settings.setting import flat_settings

@@ -1,11 +1,11 @@
 """Merge pairs greedily, as NanoGS (2026) and the decimation of splat-transform do.
 
 Each round builds a graph of nearest neighbours and computes the cost of merging each connected pair. Each round selects
-disjoint pairs by cost, and replaces each pair by the Gaussian with its moments, see :mod:`gsmerge.stages.pair_merge`.
-As in splat-transform, the mass of a Gaussian is its opacity times the area of its ellipsoid. A merged Gaussian has the
-sum of the masses, and an opacity of at most 1 that follows from the sum. The cost is Runnalls' bound on the
-Kullback-Leibler divergence (2007), per unit of mass, plus the squared distance of the harmonics. The cost does not
-depend on the scale of the scene, so pairs far from the cameras cost as much as near pairs.
+disjoint pairs by cost, and replaces each pair by the Gaussian with its moments, see
+:mod:`gsmerge.method.stages.pair_merge`. As in splat-transform, the mass of a Gaussian is its opacity times the area of
+its ellipsoid. A merged Gaussian has the sum of the masses, and an opacity of at most 1 that follows from the sum. The
+cost is Runnalls' bound on the Kullback-Leibler divergence (2007), per unit of mass, plus the squared distance of the
+harmonics. The cost does not depend on the scale of the scene, so pairs far from the cameras cost as much as near pairs.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gsmerge.geometry.pooling import MAX_OPACITY
-from gsmerge.kernels.elementary import log, power
+from gsmerge.method.geometry.pooling import MAX_OPACITY
+from gsmerge.method.kernels.elementary import log, power
+from gsmerge.method.stages.pair_merge import FLATNESS, MIN_OPACITY, Cloud, cloud_of, gaussians_of_cloud, merge_rows
 from gsmerge.plugin import Plan, Prepared, stage
 from gsmerge.runtime.threads import parallel_map, use_threads
-from gsmerge.stages.pair_merge import FLATNESS, MIN_OPACITY, Cloud, cloud_of, gaussians_of_cloud, merge_rows
 from gsmerge.types import Gaussians
 
 Floats = NDArray[np.float64]

@@ -8,16 +8,16 @@ from pathlib import Path
 
 import numpy as np
 
-from gsmerge.fit import fit_scene
 from gsmerge.io import read_ply, write_ply
 from gsmerge.io.formats.splat_transform import run_program
+from gsmerge.method.fit import fit_scene
+from gsmerge.method.stages.assign import assign
+from gsmerge.method.stages.decode import decode
+from gsmerge.method.stages.encode import encode
+from gsmerge.method.stages.superpixels import superpixels
 from gsmerge.plugin import Plan, Prepared, stage
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.stages import DecodeOptions
-from gsmerge.stages.assign import assign
-from gsmerge.stages.decode import decode
-from gsmerge.stages.encode import encode
-from gsmerge.stages.superpixels import superpixels
 from gsmerge.types import Decoded, Gaussians, Groups
 
 

@@ -8,11 +8,11 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from gsmerge.facts.prepared import LEAST_VIEWS
 from gsmerge.frozen import asdict, dataclass, field, replace
-from gsmerge.geometry.views import subset
 from gsmerge.io.formats.ply import file_bytes
 from gsmerge.io.jsonl import each_line
+from gsmerge.method.facts.prepared import LEAST_VIEWS
+from gsmerge.method.geometry.views import subset
 from gsmerge.reading.held_out import HeldOutViews, read_held_out
 from gsmerge.reading.read_scene import read_files
 from gsmerge.reading.scene_files import find_scene_files

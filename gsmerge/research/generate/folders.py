@@ -15,7 +15,7 @@ from gsmerge.frozen import asdict, dataclass
 from gsmerge.io import write_ply
 from gsmerge.io.atomic import AddOutput, atomic_outputs
 from gsmerge.io.cameras.camera_file import FLIP
-from gsmerge.kernels.matrices import matmul
+from gsmerge.method.kernels.matrices import matmul
 from gsmerge.research.generate.photograph import Float
 from gsmerge.research.generate.shapes import invert_motion
 from gsmerge.research.generate.synthetic_scene import GenerateOptions, make_synthetic_scene

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 
 from gsmerge.frozen import dataclass, fields, make_dataclass
-from gsmerge.kernels.elementary import exp, log
-from gsmerge.kernels.pictures import blur, convolve
-from gsmerge.kernels.raster.project import view_colors
+from gsmerge.method.kernels.elementary import exp, log
+from gsmerge.method.kernels.pictures import blur, convolve
+from gsmerge.method.kernels.raster.project import view_colors
 from gsmerge.research.generate.photograph import Float, Pinhole
 from gsmerge.research.generate.shapes import Array, rotate
 from gsmerge.research.generate.textures import enlarge_texture

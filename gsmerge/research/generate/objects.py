@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsmerge.kernels.elementary import cos, sin
+from gsmerge.method.kernels.elementary import cos, sin
 from gsmerge.research.generate.photograph import Light, Room
 from gsmerge.research.generate.shapes import (
     LYING,

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsmerge.frozen import dataclass
-from gsmerge.kernels.cast import BLOB, BOX, CONE, ELLIPSOID, add_light, cast
-from gsmerge.kernels.elementary import arctan2, cos, power, sin
-from gsmerge.kernels.matrices import matmul
+from gsmerge.method.kernels.cast import BLOB, BOX, CONE, ELLIPSOID, add_light, cast
+from gsmerge.method.kernels.elementary import arctan2, cos, power, sin
+from gsmerge.method.kernels.matrices import matmul
 from gsmerge.research.generate.shapes import Array, Shape, ShapeArrays, half_sizes, norm, pack_shapes, rotate
 from gsmerge.research.generate.textures import Texture, make_mipmaps
 

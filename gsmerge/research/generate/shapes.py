@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsmerge.frozen import dataclass, field, replace
-from gsmerge.kernels.cast import BLOB, BOX, CONE, ELLIPSOID, LEAF, QUAD
-from gsmerge.kernels.elementary import cos, sin
-from gsmerge.kernels.matrices import matmul
+from gsmerge.method.kernels.cast import BLOB, BOX, CONE, ELLIPSOID, LEAF, QUAD
+from gsmerge.method.kernels.elementary import cos, sin
+from gsmerge.method.kernels.matrices import matmul
 
 Array: TypeAlias = NDArray[Any]
 Vector: TypeAlias = Sequence[float] | Array  # of length 3
@@ -33,7 +33,7 @@ class Material:
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """One shape; see :mod:`gsmerge.kernels.cast` for the kinds."""
+    """One shape; see :mod:`gsmerge.method.kernels.cast` for the kinds."""
 
     kind: int
     size: tuple[float, float, float, float]  # half sizes along its axes, and the taper of a cone

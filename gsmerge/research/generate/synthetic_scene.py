@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 
 from gsmerge.frozen import asdict, dataclass, replace
-from gsmerge.geometry.transforms import quat_to_rotmat
-from gsmerge.kernels.elementary import cos, exp, sin
-from gsmerge.kernels.matrices import matmul
-from gsmerge.kernels.pictures import blur
+from gsmerge.method.geometry.transforms import quat_to_rotmat
+from gsmerge.method.kernels.elementary import cos, exp, sin
+from gsmerge.method.kernels.matrices import matmul
+from gsmerge.method.kernels.pictures import blur
 from gsmerge.research.generate.noise import Noise, NoiseOptions, TrueView, draw_noise, pixel_gaussians
 from gsmerge.research.generate.objects import build_room
 from gsmerge.research.generate.photograph import (

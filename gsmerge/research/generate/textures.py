@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsmerge.kernels import pictures
-from gsmerge.kernels.elementary import cos, power, sin
+from gsmerge.method.kernels import pictures
+from gsmerge.method.kernels.elementary import cos, power, sin
 from gsmerge.research.generate.shapes import Material
 
 Texture: TypeAlias = NDArray[Any]  # [size,size,3] float32 that repeats without a seam, sRGB in [0, 1]

@@ -15,9 +15,12 @@ import numpy as np
 
 from gsmerge.errors import SceneError
 from gsmerge.frozen import dataclass, fields, replace
-from gsmerge.geometry.pooling import Members, feature_to_gaussians
-from gsmerge.geometry.transforms import lower_median
-from gsmerge.raster.photos import Photos, blank_photos, scene_pictures
+from gsmerge.method.geometry.pooling import Members, feature_to_gaussians
+from gsmerge.method.geometry.transforms import lower_median
+from gsmerge.method.raster.photos import Photos, blank_photos, scene_pictures
+from gsmerge.method.stages.encode import encode
+from gsmerge.method.stages.merge import take_features
+from gsmerge.method.stages.superpixels import segment
 from gsmerge.reading.held_out import read_held_out
 from gsmerge.reading.read_scene import load_scene
 from gsmerge.research.training.scenes import (
@@ -30,9 +33,6 @@ from gsmerge.research.training.scenes import (
 from gsmerge.research.training.train_options import TrainOptions
 from gsmerge.settings.budget import share_text
 from gsmerge.settings.compact import CompactOptions
-from gsmerge.stages.encode import encode
-from gsmerge.stages.merge import take_features
-from gsmerge.stages.superpixels import segment
 from gsmerge.types import SH_C0, Cameras, FeatureGaussians, Gaussians, Pixels
 
 

@@ -24,9 +24,9 @@ from torch.nn import Parameter
 
 from gsmerge.errors import SceneError
 from gsmerge.frozen import dataclass
-from gsmerge.geometry.views import even_views
 from gsmerge.io.atomic import atomic_output
-from gsmerge.networks.corrections import LOGIT_COLUMN
+from gsmerge.method.geometry.views import even_views
+from gsmerge.method.networks.corrections import LOGIT_COLUMN
 from gsmerge.reading.checkpoint import save_checkpoint
 from gsmerge.research.training.backbones import Capture, draw_example
 from gsmerge.research.training.examples import Example, recolor

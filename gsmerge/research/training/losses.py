@@ -18,11 +18,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from gsmerge.geometry.pooling import Members, pool_members, to_gaussians
-from gsmerge.kernels.raster.step import C1, C2, WINDOW_SIDE
-from gsmerge.networks.tensors import gaussian_sizes, quat_to_rotmat, skew_vectors
-from gsmerge.raster.autograd import render_tensors
-from gsmerge.raster.photos import NEAR_PLANE
+from gsmerge.method.geometry.pooling import Members, pool_members, to_gaussians
+from gsmerge.method.kernels.raster.step import C1, C2, WINDOW_SIDE
+from gsmerge.method.networks.tensors import gaussian_sizes, quat_to_rotmat, skew_vectors
+from gsmerge.method.raster.autograd import render_tensors
+from gsmerge.method.raster.photos import NEAR_PLANE
 from gsmerge.research.training.modules import Networks
 from gsmerge.research.training.predict import Prediction, analytic_gaussians, decode_crop, predict, refine_crop
 from gsmerge.research.training.train_options import TrainOptions
@@ -121,10 +121,9 @@ def loss_ssim(image: Tensor, photo: Tensor) -> Tensor:
     """Compute the structural similarity ``[h,w,3]`` of image and photo around every pixel, differentiable by torch.
 
     Windows are uniform, which makes the gradient quick, and have ``WINDOW_SIDE`` pixels per side. Pixels beyond the
-    border are zero. Covariances are sums divided by the number of pixels. The constants of SSIM are K1 = .01 and
-    K2 = .03. The full fit has the same formula, and takes its loss and gradient from
-    ``gsmerge.kernels.raster.step``. The SSIM of reports, :func:`gsmerge.raster.metrics.ssim`, has Gaussian
-    windows, so its values differ.
+    border are zero. Covariances are sums divided by the number of pixels. The constants of SSIM are K1 = .01 and K2 =
+    .03. The full fit has the same formula, and takes its loss and gradient from ``gsmerge.method.kernels.raster.step``.
+    The SSIM of reports, :func:`gsmerge.method.raster.metrics.ssim`, has Gaussian windows, so its values differ.
     """
     stacked = torch.stack([image, photo, image * image, photo * photo, image * photo]).permute(0, 3, 1, 2)
     mx, my, xx, yy, xy = functional.avg_pool2d(stacked, WINDOW_SIDE, 1, WINDOW_SIDE // 2).permute(0, 2, 3, 1)

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.nn.functional import scaled_dot_product_attention
 
 from gsmerge.arrays import Array, as_array, as_tensor
-from gsmerge.networks.options import (
+from gsmerge.method.networks.options import (
     FEATURE,
     GROUP_COLUMNS,
     MEMBER_COLUMNS,
@@ -26,7 +26,7 @@ from gsmerge.networks.options import (
     SLOTS,
     NetworkOptions,
 )
-from gsmerge.networks.weights import NetworkWeights
+from gsmerge.method.networks.weights import NetworkWeights
 
 
 def mlp(*widths: int) -> nn.Sequential:

@@ -1,10 +1,11 @@
 """Predict with all networks for crops of examples, with gradients through every stage.
 
 The geometry of the stages is computed on tensors here, so that gradients pass from the results of a stage to the
-results of earlier stages. The formulas are those of the kernels that the stages use (:mod:`gsmerge.networks.tokens`,
-:mod:`gsmerge.geometry.pooling`, :mod:`gsmerge.networks.corrections`). Choices have no gradient: members, neighbours,
-clusters, order of axes, views, and the agreement of a group with other views. A value that is "zero, with a gradient"
-is added to results of kernels: this addition gives the results a gradient, and does not change their values.
+results of earlier stages. The formulas are those of the kernels that the stages use
+(:mod:`gsmerge.method.networks.tokens`, :mod:`gsmerge.method.geometry.pooling`,
+:mod:`gsmerge.method.networks.corrections`). Choices have no gradient: members, neighbours, clusters, order of axes,
+views, and the agreement of a group with other views. A value that is "zero, with a gradient" is added to results of
+kernels: this addition gives the results a gradient, and does not change their values.
 """
 
 from __future__ import annotations
@@ -16,9 +17,9 @@ from torch.nn.functional import normalize
 
 from gsmerge.arrays import Array, as_array, as_tensor
 from gsmerge.frozen import dataclass, replace
-from gsmerge.geometry.pooling import MAX_OPACITY, Members, principal_axes
-from gsmerge.networks.apply import NetworkContext, prepare_children, run_heads
-from gsmerge.networks.corrections import (
+from gsmerge.method.geometry.pooling import MAX_OPACITY, Members, principal_axes
+from gsmerge.method.networks.apply import NetworkContext, prepare_children, run_heads
+from gsmerge.method.networks.corrections import (
     COLOR_COLUMNS,
     LOGIT_COLUMN,
     MASS_COLUMN,
@@ -26,9 +27,9 @@ from gsmerge.networks.corrections import (
     ROTATION_COLUMNS,
     SIZE_COLUMNS,
 )
-from gsmerge.networks.cross_view_stats import NUM_STATS
-from gsmerge.networks.options import CORRECTED, PART_COLUMNS
-from gsmerge.networks.tensors import (
+from gsmerge.method.networks.cross_view_stats import NUM_STATS
+from gsmerge.method.networks.options import CORRECTED, PART_COLUMNS
+from gsmerge.method.networks.tensors import (
     gaussian_sizes,
     move_tensors,
     quat_to_rotmat,
@@ -36,13 +37,13 @@ from gsmerge.networks.tensors import (
     rotate_vectors,
     skew_vectors,
 )
-from gsmerge.networks.tokens import GroupFeatures
+from gsmerge.method.networks.tokens import GroupFeatures
+from gsmerge.method.stages.decode import divide_groups
+from gsmerge.method.stages.match import match
+from gsmerge.method.stages.merge import cluster_runs, merge, pool_runs, take_features
 from gsmerge.research.training.modules import Networks
 from gsmerge.research.training.train_options import TrainOptions
 from gsmerge.research.training.windows import Crop
-from gsmerge.stages.decode import divide_groups
-from gsmerge.stages.match import match
-from gsmerge.stages.merge import cluster_runs, merge, pool_runs, take_features
 from gsmerge.types import SH_C0, FeatureGaussians, Gaussians, Matches
 
 TINY = 1e-12  # least length whose logarithm is taken, world units
@@ -69,8 +70,9 @@ def groups_to_arrays(groups: GroupFeatures) -> GroupFeatures:
 def differentiate_axes(covars: Tensor) -> tuple[Tensor, Tensor]:
     """Compute scales ``[g,3]``, ascending, and quaternions ``[g,4]`` of covariances ``[g,3,3]``, differentiable.
 
-    Values are those of :func:`gsmerge.geometry.pooling.principal_axes`. Gradients follow from first-order perturbation
-    theory. Axes of nearly equal scales have no clear direction, so the gradient of their rotation is damped.
+    Values are those of :func:`gsmerge.method.geometry.pooling.principal_axes`. Gradients follow from first-order
+    perturbation theory. Axes of nearly equal scales have no clear direction, so the gradient of their rotation is
+    damped.
     """
     scales, quats = (torch.from_numpy(axes).float() for axes in principal_axes(as_array(covars)))
     if not covars.requires_grad:
@@ -87,7 +89,7 @@ def differentiate_axes(covars: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def differentiate_base(features: FeatureGaussians) -> Gaussians:
-    """Decode Feature Gaussians like :func:`gsmerge.geometry.pooling.feature_to_gaussians`, differentiable."""
+    """Decode Feature Gaussians like :func:`gsmerge.method.geometry.pooling.feature_to_gaussians`, differentiable."""
     scales, quats = differentiate_axes(features.covars)
     depths = features.extinctions * as_tensor(features.gains) / (scales[:, 1] * scales[:, 2])
     opacities = (1 - torch.exp(-depths)).clamp(0, MAX_OPACITY)
@@ -134,7 +136,7 @@ def differentiate_tokens(
 ) -> Tensor:
     """Describe Gaussians relative to their groups by tokens ``[n,13]``, as tensors with a gradient.
 
-    The function and its arguments are those of :func:`gsmerge.networks.tokens.part_tokens`.
+    The function and its arguments are those of :func:`gsmerge.method.networks.tokens.part_tokens`.
     """
     g, owner_ids = group_features, torch.from_numpy(owners)
     selected = parts[torch.from_numpy(ids)]
@@ -177,7 +179,7 @@ def pool_tensors(features: FeatureGaussians, order: np.ndarray, cuts: np.ndarray
     """Pool each cluster of Feature Gaussians into one, as tensors with a gradient.
 
     The rows of the clusters are ``order``, cluster after cluster. ``cuts`` are the places in ``order`` where clusters
-    begin. Values are those of :func:`gsmerge.stages.merge.pool_runs`.
+    begin. Values are those of :func:`gsmerge.method.stages.merge.pool_runs`.
     """
     pooled = pool_runs(features_to_arrays(features), order, cuts)
     clusters = torch.from_numpy(np.repeat(np.arange(len(cuts)), np.diff(np.append(cuts, len(order)))))
@@ -218,7 +220,7 @@ class TrainingContext(NetworkContext):
         """Make tokens.
 
         Tokens of Gaussians are tensors, but tokens of members are arrays, since no network changes members. The
-        arguments are those of :func:`gsmerge.networks.tokens.part_tokens`.
+        arguments are those of :func:`gsmerge.method.networks.tokens.part_tokens`.
         """
         if isinstance(parts, Gaussians):
             return differentiate_tokens(parts, ids, owners, group_features)
@@ -227,7 +229,7 @@ class TrainingContext(NetworkContext):
     def correct_features(self, group_features: GroupFeatures, residuals: Array) -> FeatureGaussians:
         """Apply corrections ``residuals [g,14]`` to Feature Gaussians, as tensors with a gradient.
 
-        The corrections are those of :func:`gsmerge.networks.corrections.move_features`.
+        The corrections are those of :func:`gsmerge.method.networks.corrections.move_features`.
         """
         g, f = group_features, group_features.features
         # Rotations of the rotation vectors (Rodrigues), also differentiable at zero
@@ -312,7 +314,7 @@ def refine_crop(crop: Crop, networks: Networks, options: TrainOptions, seed: int
     matches = match(features_to_arrays(encoded), options.match_options())
     alone, order, cuts = cluster_runs(matches)
     merged = encoded
-    if len(order) > 0:  # as in gsmerge.stages.merge.merge, but tensors with a gradient
+    if len(order) > 0:  # as in gsmerge.method.stages.merge.merge, but tensors with a gradient
         pooled = context.merge(pool_tensors(encoded, order, cuts), encoded, order, cuts)
         merged = FeatureGaussians.concat([take_features(encoded, alone), pooled])
     refined = context.refine(merged)

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from gsmerge.frozen import dataclass
-from gsmerge.geometry.frame import canonicalise
-from gsmerge.geometry.pooling import Members, scene_members
-from gsmerge.geometry.views import concat_cameras, even_views, resize_cameras, subset
-from gsmerge.raster import composite, make_splats, tile_view
-from gsmerge.raster.photos import NEAR_PLANE, Photos, photos_of
+from gsmerge.method.geometry.frame import canonicalise
+from gsmerge.method.geometry.pooling import Members, scene_members
+from gsmerge.method.geometry.views import concat_cameras, even_views, resize_cameras, subset
+from gsmerge.method.raster import composite, make_splats, tile_view
+from gsmerge.method.raster.photos import NEAR_PLANE, Photos, photos_of
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.scoring.sizes import resize_photo
 from gsmerge.scoring.visibility import context_points, visible_pixels

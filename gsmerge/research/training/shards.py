@@ -19,10 +19,10 @@ from safetensors.numpy import save
 
 from gsmerge.errors import SceneError
 from gsmerge.frozen import dataclass, fields
-from gsmerge.geometry.pooling import Members
 from gsmerge.io.atomic import atomic_output
 from gsmerge.jobs.content_hash import content_hash, digest, list_files
-from gsmerge.raster.photos import Photos
+from gsmerge.method.geometry.pooling import Members
+from gsmerge.method.raster.photos import Photos
 from gsmerge.reading.scene_files import find_scene_files
 from gsmerge.research.training.examples import Example, example_name, make_examples
 from gsmerge.research.training.train_options import TrainOptions

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from gsmerge.frozen import asdict, dataclass
-from gsmerge.kernels.raster.step import WINDOW_SIDE
-from gsmerge.networks.options import SLOTS, NetworkOptions
+from gsmerge.method.kernels.raster.step import WINDOW_SIDE
+from gsmerge.method.networks.options import SLOTS, NetworkOptions
 from gsmerge.scoring.lpips import require_lpips
 from gsmerge.settings.setting import Settings, setting
 from gsmerge.settings.stages import SEGMENTATIONS, MatchMethod, MatchOptions

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from gsmerge.frozen import dataclass
-from gsmerge.raster import make_splats, tile_view
-from gsmerge.raster.photos import NEAR_PLANE, Photos
+from gsmerge.method.raster import make_splats, tile_view
+from gsmerge.method.raster.photos import NEAR_PLANE, Photos
 from gsmerge.research.training.examples import Example
 from gsmerge.types import Cameras
 
@@ -120,7 +120,7 @@ def _reaching_rows(example: Example, photo: int, box: Box) -> np.ndarray:
 
 
 def box_camera(photos: Photos, photo: int, box: Box) -> dict[str, Any]:
-    """Return the camera of a rectangle of a photo, as arguments of :func:`gsmerge.raster.tile_view`."""
+    """Return the camera of a rectangle of a photo, as arguments of :func:`gsmerge.method.raster.tile_view`."""
     K = photos.Ks[photo].copy()
     K[:2, 2] -= box.left, box.top
     return {**photos.camera(photo), "K": K, "width": box.width, "height": box.height}

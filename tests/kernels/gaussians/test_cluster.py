@@ -7,8 +7,8 @@ import pytest
 from messages import refuse_all
 from scipy.sparse import coo_matrix, csgraph
 
-from gsmerge.kernels import elementary
-from gsmerge.kernels.gaussians.cluster import (
+from gsmerge.method.kernels import elementary
+from gsmerge.method.kernels.gaussians.cluster import (
     bhattacharyya,
     box_overlap,
     connected_components,

@@ -9,11 +9,11 @@ import pytest
 from messages import refuses
 from scenes import arc, make_scene, room
 
-from gsmerge.geometry.pooling import Members, scene_members
-from gsmerge.geometry.transforms import camera_distances, project
-from gsmerge.kernels import elementary
-from gsmerge.kernels.gaussians.cross_view import build_tree, nearest_of_others, partition, sum_cross_view
-from gsmerge.networks.cross_view_stats import (
+from gsmerge.method.geometry.pooling import Members, scene_members
+from gsmerge.method.geometry.transforms import camera_distances, project
+from gsmerge.method.kernels import elementary
+from gsmerge.method.kernels.gaussians.cross_view import build_tree, nearest_of_others, partition, sum_cross_view
+from gsmerge.method.networks.cross_view_stats import (
     FAR_LOG,
     MIN_SURFACE_OPACITY,
     NEAR_LOG,

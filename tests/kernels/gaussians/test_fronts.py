@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from made_gaussians import random_gaussians
 
-from gsmerge.geometry.transforms import project
-from gsmerge.kernels import elementary
-from gsmerge.kernels.gaussians.fronts import project_centres, weigh_centres
-from gsmerge.kernels.raster.binning import depth_order
+from gsmerge.method.geometry.transforms import project
+from gsmerge.method.kernels import elementary
+from gsmerge.method.kernels.gaussians.fronts import project_centres, weigh_centres
+from gsmerge.method.kernels.raster.binning import depth_order
 from gsmerge.prepare import true_pixels as pixels_module
 from gsmerge.prepare.true_pixels import find_pixels
 from gsmerge.types import Cameras, Gaussians, Scene

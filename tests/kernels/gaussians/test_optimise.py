@@ -12,9 +12,9 @@ import pytest
 from made_gaussians import random_gaussians
 from messages import refuses
 
-from gsmerge.geometry.transforms import covariances
-from gsmerge.kernels import elementary
-from gsmerge.kernels.gaussians.optimise import (
+from gsmerge.method.geometry.transforms import covariances
+from gsmerge.method.kernels import elementary
+from gsmerge.method.kernels.gaussians.optimise import (
     COLOR,
     COLUMNS,
     LOGIT,

@@ -8,8 +8,8 @@ import numpy as np
 from made_gaussians import random_gaussians
 from messages import refuses
 
-from gsmerge.geometry.transforms import covariances
-from gsmerge.kernels.gaussians.pairs import CELL, agglomerate, gaussian_moments, merge_pairs
+from gsmerge.method.geometry.transforms import covariances
+from gsmerge.method.kernels.gaussians.pairs import CELL, agglomerate, gaussian_moments, merge_pairs
 
 UPPER = np.triu_indices(3)
 WEIGHT = 2.0

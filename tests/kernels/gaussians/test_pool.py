@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from messages import refuses
 
-from gsmerge.kernels import elementary
-from gsmerge.kernels.gaussians.pool import bisect, decompose, group_members, pool, split_errors
+from gsmerge.method.kernels import elementary
+from gsmerge.method.kernels.gaussians.pool import bisect, decompose, group_members, pool, split_errors
 from gsmerge.types import SH_C0
 
 

@@ -10,13 +10,13 @@ import pytest
 from messages import refuses
 from network_fixtures import Made, made
 
-from gsmerge.geometry.pooling import feature_to_gaussians
-from gsmerge.geometry.transforms import quat_to_rotmat
-from gsmerge.kernels.elementary import log
-from gsmerge.networks.corrections import move_features, move_gaussians
-from gsmerge.networks.options import FEATURE, MEMBER_COLUMNS, PART_COLUMNS, RESIDUAL
-from gsmerge.networks.tokens import GroupFeatures, compute_group_features, contiguous, part_tokens
-from gsmerge.stages.merge import take_features
+from gsmerge.method.geometry.pooling import feature_to_gaussians
+from gsmerge.method.geometry.transforms import quat_to_rotmat
+from gsmerge.method.kernels.elementary import log
+from gsmerge.method.networks.corrections import move_features, move_gaussians
+from gsmerge.method.networks.options import FEATURE, MEMBER_COLUMNS, PART_COLUMNS, RESIDUAL
+from gsmerge.method.networks.tokens import GroupFeatures, compute_group_features, contiguous, part_tokens
+from gsmerge.method.stages.merge import take_features
 from gsmerge.types import SH_C0, Gaussians
 
 Each = Callable[..., list[np.ndarray]]

@@ -12,8 +12,8 @@ import pytest
 from network_fixtures import noisy
 from sweeps import sweep
 
-from gsmerge.kernels import elementary
-from gsmerge.kernels.networks.layers import (
+from gsmerge.method.kernels import elementary
+from gsmerge.method.kernels.networks.layers import (
     GELU,
     PLAIN,
     TANH,
@@ -24,8 +24,15 @@ from gsmerge.kernels.networks.layers import (
     padded,
     scratch_size,
 )
-from gsmerge.networks.checkpoint import IN_PACKAGE
-from gsmerge.networks.options import GROUP_COLUMNS, MEMBER_COLUMNS, PART_COLUMNS, SLOTS, NetworkOptions, weight_shapes
+from gsmerge.method.networks.checkpoint import IN_PACKAGE
+from gsmerge.method.networks.options import (
+    GROUP_COLUMNS,
+    MEMBER_COLUMNS,
+    PART_COLUMNS,
+    SLOTS,
+    NetworkOptions,
+    weight_shapes,
+)
 from gsmerge.reading.checkpoint import load_checkpoint
 from gsmerge.runtime.threads import parallel_map, use_threads
 

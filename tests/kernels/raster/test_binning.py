@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsmerge.kernels import elementary
-from gsmerge.kernels.raster import binning
+from gsmerge.method.kernels import elementary
+from gsmerge.method.kernels.raster import binning
 
 RNG = np.random.default_rng(0)
 

@@ -25,9 +25,9 @@ from sweeps import sweep
 from view_gradients_of import assert_near, full, normal, turned_view
 
 from gsmerge import Cameras, Gaussians, render
-from gsmerge.raster import TiledView, composite, make_splats, tile_view
-from gsmerge.raster.composite import view_colors
-from gsmerge.raster.gradient import Gradients, color_gradients, gradients_of
+from gsmerge.method.raster import TiledView, composite, make_splats, tile_view
+from gsmerge.method.raster.composite import view_colors
+from gsmerge.method.raster.gradient import Gradients, color_gradients, gradients_of
 from gsmerge.runtime.threads import use_threads
 
 torch = pytest.importorskip("torch", reason="torch is not installed")
@@ -75,8 +75,8 @@ def test_gradients_take_opacities_in_place_of_the_gaussians_own() -> None:
 
 @pytest.mark.parametrize("threads", [2, 8])
 def test_gradients_have_the_same_bits_on_any_number_of_threads(threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys.modules["gsmerge.raster.tiled_view"], "THREAD_PIECE", 200)
-    monkeypatch.setattr(sys.modules["gsmerge.raster.gradient"], "MIN_PER_THREAD", 200)
+    monkeypatch.setattr(sys.modules["gsmerge.method.raster.tiled_view"], "THREAD_PIECE", 200)
+    monkeypatch.setattr(sys.modules["gsmerge.method.raster.gradient"], "MIN_PER_THREAD", 200)
     gaussians, cameras = random_gaussians(2000, 3, 10).numpy(), turned_cameras(1).numpy()
     gaussians = replace(gaussians, scales=gaussians.scales * 0.3)
     K, size = cameras.Ks[0] * [[4.0], [4.0], [1.0]], (4 * HEIGHT, 4 * WIDTH)

@@ -11,10 +11,10 @@ from numpy.testing import assert_allclose
 from slow_renderer import render_arrays
 from sweeps import sweep
 
-from gsmerge.kernels.raster.contribution import FIRST_PAIRS, add_row, dominant_labels, settle_row
-from gsmerge.raster import make_splats, tile_view
-from gsmerge.stages.assign import find_owners
-from gsmerge.stages.superpixels import superpixels
+from gsmerge.method.kernels.raster.contribution import FIRST_PAIRS, add_row, dominant_labels, settle_row
+from gsmerge.method.raster import make_splats, tile_view
+from gsmerge.method.stages.assign import find_owners
+from gsmerge.method.stages.superpixels import superpixels
 from gsmerge.types import Cameras, Gaussians, Groups, Scene
 
 WIDTH, HEIGHT = 75, 53  # not multiples of a tile

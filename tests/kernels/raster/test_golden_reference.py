@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 
 from gsmerge import Cameras, Gaussians
-from gsmerge.raster import render
-from gsmerge.raster.metrics import psnr
+from gsmerge.method.raster import render
+from gsmerge.method.raster.metrics import psnr
 
 SHARED = Path(os.environ.get("GSMERGE_DATA", Path(__file__).resolve().parents[4] / "shared"))
 GOLDEN = SHARED / "golden"

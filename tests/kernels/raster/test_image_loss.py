@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from slow_steps import differentiate_rows, image_gradient
 
-from gsmerge.kernels.raster.step import C1, C2
+from gsmerge.method.kernels.raster.step import C1, C2
 
 torch = pytest.importorskip("torch", reason="torch is not installed")
 avg_pool2d = torch.nn.functional.avg_pool2d

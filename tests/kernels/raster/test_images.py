@@ -11,9 +11,9 @@ from slow_renderer import Reference, footprints, render_arrays
 from sweeps import sweep
 
 from gsmerge import Cameras, Gaussians
-from gsmerge.kernels import elementary
-from gsmerge.raster import composite, contributions, make_splats, render, splat_adjoint, tile_view
-from gsmerge.raster.metrics import psnr
+from gsmerge.method.kernels import elementary
+from gsmerge.method.raster import composite, contributions, make_splats, render, splat_adjoint, tile_view
+from gsmerge.method.raster.metrics import psnr
 
 WIDTH, HEIGHT = 45, 37  # not multiples of a tile
 

@@ -11,8 +11,8 @@ from made_gaussians import random_gaussians
 from numpy.testing import assert_allclose
 from slow_renderer import render_arrays
 
-from gsmerge.geometry.transforms import quat_to_rotmat
-from gsmerge.kernels.raster.blend import (
+from gsmerge.method.geometry.transforms import quat_to_rotmat
+from gsmerge.method.kernels.raster.blend import (
     SUMS,
     add_slots,
     blend,
@@ -23,8 +23,8 @@ from gsmerge.kernels.raster.blend import (
     survey,
     weighted_sums,
 )
-from gsmerge.kernels.raster.list_weights import LANES, collect, list_weights
-from gsmerge.raster import TiledView, composite, make_splats, splat_adjoint, tile_view
+from gsmerge.method.kernels.raster.list_weights import LANES, collect, list_weights
+from gsmerge.method.raster import TiledView, composite, make_splats, splat_adjoint, tile_view
 from gsmerge.types import Gaussians
 
 WIDTH, HEIGHT = 45, 37  # not multiples of a tile

@@ -13,9 +13,9 @@ import pytest
 from messages import refuses
 from slow_steps import differentiate_rows
 
-from gsmerge.kernels.elementary import exp, sin
-from gsmerge.kernels.raster import project
-from gsmerge.kernels.raster import step as step_kernels
+from gsmerge.method.kernels.elementary import exp, sin
+from gsmerge.method.kernels.raster import project
+from gsmerge.method.kernels.raster import step as step_kernels
 
 RNG = np.random.default_rng(0)
 HOSTILE = np.array([np.nan, np.inf, -np.inf, 3e38, -3e38, 1e-40, 0, -0.0], np.float32)

@@ -7,9 +7,9 @@ import pytest
 from slow_renderer import random_gaussians, turned_cameras, view_colors
 from view_gradients_of import assert_near, full, normal, turned_view
 
-from gsmerge.kernels.raster import project
-from gsmerge.raster.composite import view_colors as drawn_colors
-from gsmerge.raster.gradient import color_gradients
+from gsmerge.method.kernels.raster import project
+from gsmerge.method.raster.composite import view_colors as drawn_colors
+from gsmerge.method.raster.gradient import color_gradients
 
 torch = pytest.importorskip("torch", reason="torch is not installed")
 

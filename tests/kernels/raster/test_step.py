@@ -1,6 +1,6 @@
 """Phases of a step read and write nothing outside the buffers on any numbers, as sanitizers would see.
 
-That the bits are those of a slow twin is in ``tests/unit/fit/test_steps.py``.
+That the bits are those of a slow twin is in ``tests/unit/method/fit/test_steps.py``.
 """
 
 from contextlib import suppress
@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from messages import refuses
 
-from gsmerge.fit.fit_state import FitState, start_state
-from gsmerge.fit.step_buffers import OF_STEP, StepBuffers
-from gsmerge.kernels.raster.project import POSE
-from gsmerge.kernels.raster.step import PHASES, STEP, fit_phase
-from gsmerge.kernels.signature import FilledTable
-from gsmerge.raster import tiled_view
-from gsmerge.raster.tiled_view import camera_numbers
+from gsmerge.method.fit.fit_state import FitState, start_state
+from gsmerge.method.fit.step_buffers import OF_STEP, StepBuffers
+from gsmerge.method.kernels.raster.project import POSE
+from gsmerge.method.kernels.raster.step import PHASES, STEP, fit_phase
+from gsmerge.method.kernels.signature import FilledTable
+from gsmerge.method.raster import tiled_view
+from gsmerge.method.raster.tiled_view import camera_numbers
 from gsmerge.types import Gaussians
 
 WIDTH, HEIGHT = 37, 21

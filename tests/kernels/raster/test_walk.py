@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from sweeps import sweep
 
-from gsmerge.kernels import elementary
-from gsmerge.kernels.raster.blend import parts_of_tile
-from gsmerge.kernels.raster.project import TILE
+from gsmerge.method.kernels import elementary
+from gsmerge.method.kernels.raster.blend import parts_of_tile
+from gsmerge.method.kernels.raster.project import TILE
 
 BATCH = 32  # Gaussians that the kernels take at once
 LEFT, TOP = 32, 48  # the tile's first pixel

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsmerge.kernels.superpixels import bass
+from gsmerge.method.kernels.superpixels import bass
 
 SIZE = (17, 23)
 

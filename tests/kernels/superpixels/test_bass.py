@@ -8,10 +8,10 @@ import pytest
 from regions_of_noise import RING, SPREAD, ring_of, total_error
 from skimage.measure import label as connected_parts
 
-from gsmerge.kernels.elementary import log
-from gsmerge.kernels.superpixels import bass, regions
-from gsmerge.kernels.superpixels.bass import hexagonal_seeds, seed_density
-from gsmerge.kernels.superpixels.regions import pad_labels, region_rows
+from gsmerge.method.kernels.elementary import log
+from gsmerge.method.kernels.superpixels import bass, regions
+from gsmerge.method.kernels.superpixels.bass import hexagonal_seeds, seed_density
+from gsmerge.method.kernels.superpixels.regions import pad_labels, region_rows
 
 
 def test_simple_points_do_not_change_the_parts_of_either_side() -> None:

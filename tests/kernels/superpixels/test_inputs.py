@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from messages import refuses
 
-from gsmerge.kernels.superpixels import bass, merge_tree, regions, ward
-from gsmerge.kernels.superpixels.regions import pad_labels
+from gsmerge.method.kernels.superpixels import bass, merge_tree, regions, ward
+from gsmerge.method.kernels.superpixels.regions import pad_labels
 
 SPREAD = np.float32(0.01)
 ONE = pad_labels(np.zeros((1, 1), int))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from regions_of_noise import COMPACTNESS, features, squared_error, total_error
 
-from gsmerge.kernels.superpixels import regions
+from gsmerge.method.kernels.superpixels import regions
 
 
 def test_integral_image_sums_the_pixels_above_and_left(pixels: np.ndarray) -> None:

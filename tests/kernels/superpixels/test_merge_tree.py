@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from sweeps import sweep
 
-from gsmerge.kernels import elementary
-from gsmerge.kernels.superpixels import merge_tree as kernels
-from gsmerge.kernels.superpixels.bass import hexagonal_seeds, voronoi
-from gsmerge.kernels.superpixels.regions import pad_labels
-from gsmerge.kernels.superpixels.ward import adjacent_pairs
+from gsmerge.method.kernels import elementary
+from gsmerge.method.kernels.superpixels import merge_tree as kernels
+from gsmerge.method.kernels.superpixels.bass import hexagonal_seeds, voronoi
+from gsmerge.method.kernels.superpixels.regions import pad_labels
+from gsmerge.method.kernels.superpixels.ward import adjacent_pairs
 
 SLOPE_RIDGE = 1e-3  # square pixels, as in merge_tree.c
 

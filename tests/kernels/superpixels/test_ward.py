@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from regions_of_noise import SPREAD, features, neighbours, squared_error, total_error
 
-from gsmerge.kernels.superpixels import ward
-from gsmerge.kernels.superpixels.regions import pad_labels, region_rows
+from gsmerge.method.kernels.superpixels import ward
+from gsmerge.method.kernels.superpixels.regions import pad_labels, region_rows
 
 
 def test_region_rows_are_means(pixels: np.ndarray, labels: np.ndarray) -> None:

@@ -14,12 +14,12 @@ from sweeps import sweep
 from gsmerge import CompactOptions, EvaluateOptions, compact, evaluate
 from gsmerge.blocks.fit_seams import join_views
 from gsmerge.errors import UsageError
-from gsmerge.facts.pictures import ROW_COLORS
-from gsmerge.facts.scene_size import measure_size
-from gsmerge.fit import FitJob, FitOptions, fit_gaussians
-from gsmerge.fit.photo_sizes import fit_photos
-from gsmerge.geometry.frame import canonicalise
-from gsmerge.geometry.views import subset
+from gsmerge.method.facts.pictures import ROW_COLORS
+from gsmerge.method.facts.scene_size import measure_size
+from gsmerge.method.fit import FitJob, FitOptions, fit_gaussians
+from gsmerge.method.fit.photo_sizes import fit_photos
+from gsmerge.method.geometry.frame import canonicalise
+from gsmerge.method.geometry.views import subset
 from gsmerge.plan.blocks import choose_blocks
 from gsmerge.runtime import memory
 from gsmerge.settings.budget import DEVICES

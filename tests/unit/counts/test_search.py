@@ -13,11 +13,11 @@ from messages import noted, refuses
 
 from gsmerge.counts.curve import CurvePoint, count_within, curve_counts, curve_knee
 from gsmerge.counts.search import MAX_BUILDS, MAX_LEFT_OUT_BUILDS, SAME_COUNT_RATIO, CountSearch, search_count
-from gsmerge.facts.pictures import PHOTOS
-from gsmerge.facts.prepared import Prepared
-from gsmerge.fit import FitOptions, Fitted
-from gsmerge.kernels import elementary
-from gsmerge.pipelines.plan import CountPlan, Plan
+from gsmerge.method.facts.pictures import PHOTOS
+from gsmerge.method.facts.prepared import Prepared
+from gsmerge.method.fit import FitOptions, Fitted
+from gsmerge.method.kernels import elementary
+from gsmerge.method.pipelines.plan import CountPlan, Plan
 from gsmerge.plan.counts import FIDELITY_LOSS, exact_count, level_counts, max_allowed
 from gsmerge.results.candidate import Candidate
 from gsmerge.results.left_out import LeftOut

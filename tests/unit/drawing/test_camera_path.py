@@ -23,8 +23,8 @@ from gsmerge.drawing.camera_path import (
     spline,
     viewing_depth,
 )
-from gsmerge.geometry.transforms import camera_centres, motion_matrices, project
-from gsmerge.kernels import elementary
+from gsmerge.method.geometry.transforms import camera_centres, motion_matrices, project
+from gsmerge.method.kernels import elementary
 from gsmerge.scoring.fog import fog_cameras
 from gsmerge.types import Cameras
 

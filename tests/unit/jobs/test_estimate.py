@@ -9,8 +9,8 @@ from made_gaussians import random_gaussians
 
 from gsmerge import CompactOptions
 from gsmerge.counts.curve import curve_counts
-from gsmerge.facts.scene_size import SceneSize
 from gsmerge.jobs.estimate import IMPORT_SECONDS, RunCosts, estimate
+from gsmerge.method.facts.scene_size import SceneSize
 from gsmerge.plan.counts import count_limits, level_counts
 from gsmerge.plan.forecast import usual_builds
 from gsmerge.types import Cameras, Scene

@@ -14,8 +14,8 @@ from messages import noted, refuses
 from scenes import FIELDS, arc, make_scene, move, room
 
 from gsmerge import CompactResult, Gaussians, Scene, SceneError, compact, compact_tensors, evaluate, read_scene, render
-from gsmerge.geometry.transforms import sh0_to_rgb
-from gsmerge.kernels import elementary
+from gsmerge.method.geometry.transforms import sh0_to_rgb
+from gsmerge.method.kernels import elementary
 from gsmerge.reading.input import check_scene
 
 FAST: dict[str, Any] = {"effort": "draft", "superpixels": "10%", "fit": "none"}

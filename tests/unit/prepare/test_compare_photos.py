@@ -13,7 +13,7 @@ from messages import noted
 from panoramas import cut_views, shrunk
 
 from gsmerge import CompactResult, Scene, compact, render
-from gsmerge.compare.colors import (
+from gsmerge.method.compare.colors import (
     Blocks,
     cut_blocks,
     explains,
@@ -26,9 +26,9 @@ from gsmerge.compare.colors import (
     tone_blocks,
     vary_in_hue,
 )
-from gsmerge.compare.view_pictures import Pairs, ViewPictures
-from gsmerge.facts.pictures import PHOTOS, ROW_COLORS
-from gsmerge.geometry.transforms import rgb_to_sh0, sh0_to_rgb
+from gsmerge.method.compare.view_pictures import Pairs, ViewPictures
+from gsmerge.method.facts.pictures import PHOTOS, ROW_COLORS
+from gsmerge.method.geometry.transforms import rgb_to_sh0, sh0_to_rgb
 from gsmerge.prepare.compare_photos import are_exchanged, compare_photos, find_grey, have_other_tones
 from gsmerge.prepare.photo_change import LUMA, PhotoChange
 from gsmerge.prepare.prepare_scene import prepare

@@ -13,15 +13,15 @@ from motions import with_nearer_half
 
 import gsmerge
 from gsmerge import Cameras, Scene
-from gsmerge.facts.agreement import FEWEST, MOST_PER_PIXEL, Agreement
-from gsmerge.geometry.pooling import scene_members
-from gsmerge.kernels.elementary import log
+from gsmerge.method.facts.agreement import FEWEST, MOST_PER_PIXEL, Agreement
+from gsmerge.method.geometry.pooling import scene_members
+from gsmerge.method.kernels.elementary import log
+from gsmerge.method.stages.encode import encode, weaken_contradicted
 from gsmerge.plan.make_plan import make_plan
 from gsmerge.prepare.confirm_depths import AGREEMENT_PIXELS, AGREEMENT_SHARE, SAME_LOG_DEPTH, confirm_depths
 from gsmerge.prepare.prepare_scene import prepare
 from gsmerge.runtime.record import record_run
 from gsmerge.settings.compact import CompactOptions
-from gsmerge.stages.encode import encode, weaken_contradicted
 from gsmerge.types import Groups
 
 VIEWS, WIDTH, HEIGHT = 4, 48, 36

@@ -12,8 +12,8 @@ import unaligned_scenes
 from messages import noted
 
 from gsmerge import Compactor, CompactResult, Scene, compact, render
-from gsmerge.geometry.frame import canonicalise
-from gsmerge.geometry.views import subset
+from gsmerge.method.geometry.frame import canonicalise
+from gsmerge.method.geometry.views import subset
 from gsmerge.prepare.draw_outside import draw_outside
 from gsmerge.prepare.prepare_scene import prepare
 from gsmerge.prepare.steps import without

@@ -9,9 +9,9 @@ import pytest
 import scenes
 
 from gsmerge import Scene
-from gsmerge.geometry.frame import canonicalise
-from gsmerge.geometry.transforms import camera_distances
-from gsmerge.kernels import elementary
+from gsmerge.method.geometry.frame import canonicalise
+from gsmerge.method.geometry.transforms import camera_distances
+from gsmerge.method.kernels import elementary
 from gsmerge.prepare.exposure import (
     FARTHER_VIEWS,
     FOLLOWS,

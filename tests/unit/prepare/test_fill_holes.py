@@ -16,12 +16,12 @@ from messages import noted
 from tiny_scene import write_npz
 
 from gsmerge import Scene, compact
-from gsmerge.geometry.transforms import camera_depths, rgb_to_sh0
-from gsmerge.kernels import elementary
+from gsmerge.method.geometry.transforms import camera_depths, rgb_to_sh0
+from gsmerge.method.kernels import elementary
+from gsmerge.method.raster import render
 from gsmerge.prepare.fill_holes import LARGE_SIDE, RIM_PIXELS, fill_holes, large_parts
 from gsmerge.prepare.prepare_scene import prepare
 from gsmerge.prepare.true_pixels import with_pixels
-from gsmerge.raster import render
 from gsmerge.reading.read_scene import load_scene
 from gsmerge.runtime.record import record_run
 from gsmerge.types import Cameras, Gaussians, PicturedScene, Pixels

@@ -12,8 +12,8 @@ from PIL import Image
 from saved_cameras import write_transforms
 
 from gsmerge import Compactor, Gaussians, Scene, compact, read_scene, render, write_ply
+from gsmerge.method.raster.metrics import decibels
 from gsmerge.prepare.prepare_scene import prepare
-from gsmerge.raster.metrics import decibels
 
 WIDTH, HEIGHT = 96, 72
 FIT = {"superpixels": 200, "fit_steps": 60, "checkpoint": "none", "poses": "fixed", "new_views": False}

@@ -11,8 +11,8 @@ import scenes
 
 from gsmerge import CompactOptions, Scene, compact
 from gsmerge.counts.clean_up import build_cleaned
-from gsmerge.fit import Fitted
-from gsmerge.geometry.transforms import (
+from gsmerge.method.fit import Fitted
+from gsmerge.method.geometry.transforms import (
     evaluate_harmonics,
     motion_matrices,
     motion_vectors,
@@ -21,12 +21,12 @@ from gsmerge.geometry.transforms import (
     project,
     quat_to_rotmat,
 )
-from gsmerge.geometry.transforms import without_common_motion as without_common
+from gsmerge.method.geometry.transforms import without_common_motion as without_common
+from gsmerge.method.raster import render
+from gsmerge.method.raster.metrics import psnr
 from gsmerge.plan.make_plan import make_plan
 from gsmerge.prepare.move_poses import CHANCE, move_poses
 from gsmerge.prepare.prepare_scene import prepare
-from gsmerge.raster import render
-from gsmerge.raster.metrics import psnr
 
 VIEWS = range(5)
 GLOSS = 0.2  # strength of a highlight's harmonics

@@ -11,17 +11,17 @@ import unaligned_scenes
 from messages import noted
 
 from gsmerge import Gaussians, Scene, compact, render
-from gsmerge.facts.pictures import PHOTOS, ROW_COLORS
-from gsmerge.facts.prepared import Prepared
-from gsmerge.fit import FitOptions, fit_photos, fit_scene
-from gsmerge.geometry.transforms import project
+from gsmerge.method.facts.pictures import PHOTOS, ROW_COLORS
+from gsmerge.method.facts.prepared import Prepared
+from gsmerge.method.fit import FitOptions, fit_photos, fit_scene
+from gsmerge.method.geometry.transforms import project
+from gsmerge.method.raster.photos import MASKED_WEIGHT, scene_pictures
+from gsmerge.method.stages.fit_pairs import merge_scene
+from gsmerge.method.viewpoints.place_cameras import HELD_OUT
 from gsmerge.prepare.prepare_scene import prepare
-from gsmerge.raster.photos import MASKED_WEIGHT, scene_pictures
 from gsmerge.reading.photos.scene_photos import without_photo
 from gsmerge.runtime.record import record_part, record_run
-from gsmerge.stages.fit_pairs import merge_scene
 from gsmerge.types import NO_CAMERAS, make_scene
-from gsmerge.viewpoints.place_cameras import HELD_OUT
 
 
 def test_renders_stand_in_for_photos_only_where_no_pixels_are_known() -> None:

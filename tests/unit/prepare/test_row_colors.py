@@ -11,9 +11,9 @@ import scenes
 from messages import noted
 
 from gsmerge import Scene
-from gsmerge.geometry.transforms import rgb_to_sh0
+from gsmerge.method.geometry.transforms import rgb_to_sh0
+from gsmerge.method.raster.photos import scene_pictures
 from gsmerge.prepare.row_colors import FAINT_OPACITY, add_row_colors
-from gsmerge.raster.photos import scene_pictures
 from gsmerge.runtime.record import record_run
 from gsmerge.types import Gaussians, Pixels
 

@@ -9,7 +9,7 @@ import pytest
 import scenes
 
 from gsmerge import Scene, compact
-from gsmerge.geometry.views import subset
+from gsmerge.method.geometry.views import subset
 from gsmerge.prepare.prepare_scene import prepare
 from gsmerge.prepare.steps import STEPS, select, without
 from gsmerge.types import NO_CAMERAS, make_scene

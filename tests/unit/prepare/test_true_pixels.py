@@ -10,9 +10,9 @@ import scenes
 import unaligned_scenes
 
 from gsmerge import Gaussians, Scene, compact
-from gsmerge.geometry.frame import canonicalise
-from gsmerge.geometry.transforms import camera_depths
-from gsmerge.kernels import elementary
+from gsmerge.method.geometry.frame import canonicalise
+from gsmerge.method.geometry.transforms import camera_depths
+from gsmerge.method.kernels import elementary
 from gsmerge.prepare.true_pixels import HIDDEN_SIZE, LOW_PASS, choose_level, find_pixels, raise_sizes, with_pixels
 from gsmerge.runtime.record import record_run
 from gsmerge.types import NO_CAMERAS

@@ -15,7 +15,7 @@ from sweeps import sweep
 from tiny_scene import FLIP, Tiny, edited_json, make_tiny, rotation
 
 from gsmerge.errors import SceneError
-from gsmerge.geometry.transforms import fit_similarity
+from gsmerge.method.geometry.transforms import fit_similarity
 from gsmerge.reading import larger_photos as scene_views
 from gsmerge.reading.held_out import read_held_out
 from gsmerge.reading.read_scene import Loaded, load_scene

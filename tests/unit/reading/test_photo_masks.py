@@ -15,10 +15,10 @@ from messages import names, noted, refuses
 from tiny_scene import Tiny
 
 from gsmerge.errors import SceneError
-from gsmerge.geometry.views import subset
 from gsmerge.io.image_names import match_masks
 from gsmerge.io.photo_files import decode_alpha, decode_levels
 from gsmerge.jobs.inspect import inspect
+from gsmerge.method.geometry.views import subset
 from gsmerge.reading.read_scene import load_scene, read_scene
 
 

@@ -19,8 +19,8 @@ from tiny_scene import Tiny, edited_json
 import gsmerge
 from gsmerge import Scene
 from gsmerge.errors import SceneError
-from gsmerge.fit.photo_sizes import large_photos, largest_scale
-from gsmerge.raster.metrics import psnr
+from gsmerge.method.fit.photo_sizes import large_photos, largest_scale
+from gsmerge.method.raster.metrics import psnr
 from gsmerge.reading.read_scene import load_scene
 from gsmerge.research.generate import GenerateOptions, generate_scene
 

@@ -14,7 +14,7 @@ from shared import make_once, write_small
 from sweeps import sweep
 
 from gsmerge.errors import SceneError
-from gsmerge.geometry.transforms import project
+from gsmerge.method.geometry.transforms import project
 from gsmerge.reading.held_out import read_held_out
 from gsmerge.reading.read_scene import load_scene
 from gsmerge.research import stress as module

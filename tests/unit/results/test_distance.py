@@ -15,11 +15,12 @@ from messages import refuses
 import gsmerge
 from gsmerge import Gaussians, Scene, compact, render
 from gsmerge.errors import TargetError
-from gsmerge.facts.prepared import Prepared
-from gsmerge.geometry.views import resize_cameras
-from gsmerge.pipelines import pixel_rows
+from gsmerge.method.facts.prepared import Prepared
+from gsmerge.method.geometry.views import resize_cameras
+from gsmerge.method.pipelines import pixel_rows
+from gsmerge.method.raster.metrics import decibels
+from gsmerge.method.viewpoints.place_cameras import between_cameras
 from gsmerge.prepare.prepare_scene import prepare
-from gsmerge.raster.metrics import decibels
 from gsmerge.results.distance import (
     DISTANCE_BLUR,
     DISTANCE_PIXELS,
@@ -28,7 +29,6 @@ from gsmerge.results.distance import (
     describe_clear_loss,
     is_clearly_worse,
 )
-from gsmerge.viewpoints.place_cameras import between_cameras
 
 
 def make_room() -> Scene:

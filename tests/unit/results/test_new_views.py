@@ -9,9 +9,9 @@ import pytest
 import scenes
 
 from gsmerge import Gaussians, Scene, compact, render
-from gsmerge.facts.prepared import LEAST_VIEWS
-from gsmerge.geometry.views import subset
 from gsmerge.io.formats.rows import ExpectedScores, copied_comments, new_views_comment, read_expected_scores
+from gsmerge.method.facts.prepared import LEAST_VIEWS
+from gsmerge.method.geometry.views import subset
 from gsmerge.prepare.prepare_scene import prepare
 from gsmerge.results.left_out import choose_left_out, leave_out, mark_seen, mean_seen
 from gsmerge.results.new_views import OWN_WEIGHT, SPREAD, Trial, shrink_scene

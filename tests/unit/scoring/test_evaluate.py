@@ -17,8 +17,8 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 import gsmerge
 from gsmerge.cli.console import say_notes
-from gsmerge.facts.pictures import ROW_COLORS
-from gsmerge.raster.photos import scene_pictures
+from gsmerge.method.facts.pictures import ROW_COLORS
+from gsmerge.method.raster.photos import scene_pictures
 from gsmerge.runtime.documents import to_json
 from gsmerge.scoring.evaluate import INPUT, EvaluateOptions, Evaluation, evaluate, near_plane
 from gsmerge.scoring.evaluation_report import CSV_COLUMNS, evaluation_csv, evaluation_document, evaluation_lines

@@ -10,10 +10,10 @@ import scenes
 from messages import says
 from tiny_scene import rotation
 
-from gsmerge.fit.outside import PLACES, STEP_BACK_HIGH, STEP_BACK_LOW
-from gsmerge.fit.outside import outside_cameras as place_views
-from gsmerge.geometry.transforms import camera_centres
-from gsmerge.kernels import elementary
+from gsmerge.method.fit.outside import PLACES, STEP_BACK_HIGH, STEP_BACK_LOW
+from gsmerge.method.fit.outside import outside_cameras as place_views
+from gsmerge.method.geometry.transforms import camera_centres
+from gsmerge.method.kernels import elementary
 from gsmerge.scoring.fog import (
     ALL,
     FOG_CAMERAS,

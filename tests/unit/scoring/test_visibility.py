@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scenes
 
-from gsmerge.geometry.views import resize_cameras, subset
+from gsmerge.method.geometry.views import resize_cameras, subset
 from gsmerge.scoring import visibility
 from gsmerge.scoring.visibility import context_points, visible_pixels
 from gsmerge.types import Cameras, Scene

@@ -11,8 +11,8 @@ import numpy as np
 
 from gsmerge.errors import Doubt, SceneError, count_words
 from gsmerge.frozen import dataclass, replace
-from gsmerge.geometry.transforms import Similarity, rotmat_to_quat
-from gsmerge.kernels.elementary import arccos
+from gsmerge.method.geometry.transforms import Similarity, rotmat_to_quat
+from gsmerge.method.kernels.elementary import arccos
 from gsmerge.reading.alignment.registration.register import register
 from gsmerge.types import Cameras, Gaussians, LargePhotos, Pixels, Scene
 

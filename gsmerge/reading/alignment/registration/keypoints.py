@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 
 from gsmerge.frozen import dataclass, fields, replace
-from gsmerge.geometry.transforms import camera_depths, lower_median
-from gsmerge.kernels.matrices import invert, matmul
-from gsmerge.raster.photos import row_pictures
+from gsmerge.method.geometry.transforms import camera_depths, lower_median
+from gsmerge.method.kernels.matrices import invert, matmul
+from gsmerge.method.raster.photos import row_pictures
 from gsmerge.types import Scene
 
 KEYPOINT_PIXELS = 1600  # longest side of a photo in which keypoints are searched, pixels

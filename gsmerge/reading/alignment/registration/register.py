@@ -15,7 +15,7 @@ from itertools import combinations
 import numpy as np
 
 from gsmerge.frozen import dataclass, replace
-from gsmerge.geometry.transforms import (
+from gsmerge.method.geometry.transforms import (
     IDENTITY,
     NORMAL_SPREAD,
     Damping,
@@ -28,8 +28,8 @@ from gsmerge.geometry.transforms import (
     quat_to_rotmat,
     rotmat_to_quat,
 )
-from gsmerge.kernels.elementary import exp, log, log1p
-from gsmerge.kernels.matrices import eigh, matmul, solve, transform
+from gsmerge.method.kernels.elementary import exp, log, log1p
+from gsmerge.method.kernels.matrices import eigh, matmul, solve, transform
 from gsmerge.reading.alignment.registration.keypoints import KeypointMatches, MatchSide, find_keypoints, match_photos
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Scene

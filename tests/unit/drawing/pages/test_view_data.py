@@ -22,10 +22,10 @@ from gsmerge.drawing.pages.data import ViewData, collect_page_data, encode_still
 from gsmerge.drawing.pages.page import headline
 from gsmerge.drawing.pages.splats import pack_splats
 from gsmerge.drawing.preview import to_picture
-from gsmerge.facts.pictures import ROW_COLORS
-from gsmerge.geometry.frame import scene_frame
 from gsmerge.io.formats.spz import UNIX, spz_bytes
-from gsmerge.raster.metrics import psnr
+from gsmerge.method.facts.pictures import ROW_COLORS
+from gsmerge.method.geometry.frame import scene_frame
+from gsmerge.method.raster.metrics import psnr
 from gsmerge.scoring.evaluate import EvaluateOptions, near_plane
 from gsmerge.scoring.lpips import lpips_available
 from gsmerge.types import Views

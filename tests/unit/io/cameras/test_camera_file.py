@@ -33,7 +33,7 @@ from gsmerge.io.cameras.camera_file import (
     undistort_photos,
 )
 from gsmerge.jobs.inspect import inspect
-from gsmerge.kernels import elementary
+from gsmerge.method.kernels import elementary
 from gsmerge.reading.read_scene import load_scene
 
 

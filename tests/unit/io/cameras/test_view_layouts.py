@@ -14,13 +14,13 @@ from program_cameras import C2W, CX, CY, FORMATS, FX, FY, HEIGHT, K_DIVIDED, NAM
 from tiny_scene import edited_json, rotation
 
 from gsmerge.errors import SceneError
-from gsmerge.geometry.transforms import mean_pose_frame, quat_to_rotmat, rotmat_to_quat
 from gsmerge.io import read_cameras, to_cameras
 from gsmerge.io.cameras.camera_source import CameraSource
 from gsmerge.io.cameras.read_cameras import find_cameras, find_other_cameras
 from gsmerge.io.cameras.table import CAMERA_FORMATS
 from gsmerge.io.cameras.view_layout import PinholeKeys, RotationAndShift, ViewLayout, read_views
-from gsmerge.kernels.elementary import arctan2
+from gsmerge.method.geometry.transforms import mean_pose_frame, quat_to_rotmat, rotmat_to_quat
+from gsmerge.method.kernels.elementary import arctan2
 
 Change = Callable[[Any], object]
 ANGLE = 2 * float(arctan2(0.5, 1.0))  # of view: the focal length is the side's length

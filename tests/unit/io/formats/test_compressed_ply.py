@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from plyfile import PlyData, PlyElement
 
-from gsmerge.geometry.transforms import quat_to_rotmat
 from gsmerge.io import read_ply
+from gsmerge.method.geometry.transforms import quat_to_rotmat
 from gsmerge.types import SH_C0
 
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")

@@ -17,13 +17,13 @@ from slow_readers import drawn
 
 from gsmerge import Gaussians, Scene
 from gsmerge.errors import SceneError, list_doubts
-from gsmerge.geometry.transforms import multiply_quats, project, quat_to_rotmat, sh0_to_rgb
 from gsmerge.io import read_gaussians, write_gaussians
 from gsmerge.io.cameras.viewer_cameras import order_views
 from gsmerge.io.formats.glb import holds_gaussians
 from gsmerge.io.formats.read_gaussians import file_notes
 from gsmerge.io.formats.table import Contents
-from gsmerge.kernels.elementary import cos, sin
+from gsmerge.method.geometry.transforms import multiply_quats, project, quat_to_rotmat, sh0_to_rgb
+from gsmerge.method.kernels.elementary import cos, sin
 from gsmerge.results.outputs import name_outputs, write_outputs
 
 NAME = "KHR_gaussian_splatting"

@@ -15,7 +15,7 @@ from slow_readers import corners
 from gsmerge import EvaluateOptions, Gaussians, Scene, compact, evaluate, read_scene, render
 from gsmerge.io import kept_comments, read_gaussians, write_gaussians, write_ply
 from gsmerge.jobs.convert import ConvertOptions, convert_files
-from gsmerge.raster.metrics import psnr
+from gsmerge.method.raster.metrics import psnr
 from gsmerge.results.outputs import name_outputs
 from gsmerge.settings.files import PlacementOptions
 

@@ -13,12 +13,12 @@ from messages import refuses
 from sweeps import sweep
 
 from gsmerge.errors import SceneError
-from gsmerge.geometry.transforms import normalize
 from gsmerge.io import write_gaussians, write_ply
 from gsmerge.io.bounds import ReadBudget
 from gsmerge.io.formats.rows import check_gaussian_count
 from gsmerge.io.formats.sog import PACKED_BYTES
-from gsmerge.kernels import elementary
+from gsmerge.method.geometry.transforms import normalize
+from gsmerge.method.kernels import elementary
 from gsmerge.types import Gaussians
 
 COUNT, HIGHER = 150_000, 15

@@ -14,11 +14,11 @@ from plyfile import PlyData, PlyElement
 from slow_readers import drawn, read_splat, read_spz
 
 from gsmerge.errors import SceneError, list_doubts
-from gsmerge.geometry.transforms import sh0_to_rgb
 from gsmerge.io import kept_comments, read_gaussians, read_ply, write_gaussians, write_ply
 from gsmerge.io.formats.ply import header_content
 from gsmerge.io.formats.read_gaussians import file_notes, read_parts
-from gsmerge.kernels import elementary
+from gsmerge.method.geometry.transforms import sh0_to_rgb
+from gsmerge.method.kernels import elementary
 from gsmerge.runtime.threads import use_threads
 from gsmerge.types import SH_C0, Gaussians
 

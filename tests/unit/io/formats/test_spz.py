@@ -17,13 +17,13 @@ from slow_readers import corners
 
 from gsmerge import Gaussians, SceneError
 from gsmerge.errors import list_doubts
-from gsmerge.geometry.transforms import covariances, rotate_harmonics
 from gsmerge.io import kept_comments, read_gaussians, write_gaussians
 from gsmerge.io.formats.glb import glb_bytes
 from gsmerge.io.formats.read_gaussians import file_notes
 from gsmerge.io.formats.splat import splat_bytes
 from gsmerge.io.formats.spz import AXIS_SYSTEMS, gzip_bytes, spz_bytes
 from gsmerge.io.formats.table import Contents
+from gsmerge.method.geometry.transforms import covariances, rotate_harmonics
 from gsmerge.settings.files import FileOptions
 
 # Two Gaussians of degree 1 as @adobe/spz 0.2.3 writes them, which is Niantic's library for browsers

@@ -19,10 +19,10 @@ from tiny_scene import Tiny
 
 from gsmerge import Scene
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.geometry.transforms import normalize
 from gsmerge.io import OUTPUT_FORMATS, limit_notes, output_format, read_ply, write_gaussians, write_ply
 from gsmerge.io.formats.splat_transform import find_program
-from gsmerge.kernels import elementary
+from gsmerge.method.geometry.transforms import normalize
+from gsmerge.method.kernels import elementary
 from gsmerge.settings.setting import join_words
 from gsmerge.types import Gaussians
 

@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 
 from gsmerge import Cameras, Compactor, Scene, compact
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.facts.pictures import PHOTOS, RENDERS, ROW_COLORS
-from gsmerge.geometry.transforms import camera_centres
 from gsmerge.io.cameras.camera_file import to_cameras
 from gsmerge.io.cameras.read_cameras import read_cameras
 from gsmerge.jobs.states.extend import NOT_COMPARED, choose_distant_views, compare_worlds
+from gsmerge.method.facts.pictures import PHOTOS, RENDERS, ROW_COLORS
+from gsmerge.method.geometry.transforms import camera_centres
 from gsmerge.reading.read_scene import load_scene
 
 FEW = {"superpixels": "10%", "checkpoint": "none"}

@@ -13,8 +13,8 @@ from network_fixtures import SMALL, noisy, written
 
 from gsmerge import Compactor, Scene, compact
 from gsmerge.errors import UsageError
-from gsmerge.geometry.transforms import camera_centres
 from gsmerge.jobs.states.features import FeatureState
+from gsmerge.method.geometry.transforms import camera_centres
 
 PAPER: dict[str, Any] = {"recipe": "paper", "superpixels": "10%"}
 

@@ -15,8 +15,8 @@ from saved_cameras import write_transforms
 from tiny_scene import Tiny, make_tiny
 
 from gsmerge.errors import SceneError
-from gsmerge.geometry.transforms import pose_changes, project_points
 from gsmerge.io import write_gaussians
+from gsmerge.method.geometry.transforms import pose_changes, project_points
 from gsmerge.reading.alignment.conventions import move_cameras
 from gsmerge.reading.alignment.score import max_correctable_px, sample_pixels
 from gsmerge.reading.read_scene import load_scene

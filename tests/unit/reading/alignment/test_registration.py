@@ -15,8 +15,8 @@ from tiny_scene import rotation
 
 from gsmerge import Cameras, Gaussians, Scene, render
 from gsmerge.errors import SceneError
-from gsmerge.geometry.transforms import Similarity, camera_centres
-from gsmerge.geometry.views import subset
+from gsmerge.method.geometry.transforms import Similarity, camera_centres
+from gsmerge.method.geometry.views import subset
 from gsmerge.reading.alignment.registration import keypoints
 from gsmerge.reading.alignment.registration.join import join_scenes, move_scene
 from gsmerge.reading.alignment.registration.register import DIGITS, fit_similarities, register

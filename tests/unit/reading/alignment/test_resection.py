@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from gsmerge.geometry.transforms import motion_matrices
+from gsmerge.method.geometry.transforms import motion_matrices
 from gsmerge.reading.alignment.resection import (
     ALL_INTRINSICS,
     ONE_FOCAL,

@@ -16,8 +16,8 @@ from sweeps import sweep
 from tiny_scene import make_tiny, write_images
 
 from gsmerge.errors import SceneError
-from gsmerge.geometry.transforms import Similarity
-from gsmerge.kernels import elementary
+from gsmerge.method.geometry.transforms import Similarity
+from gsmerge.method.kernels import elementary
 from gsmerge.reading.alignment import unaligned
 from gsmerge.reading.read_scene import load_scene
 from gsmerge.types import SH_C0, Cameras

@@ -13,7 +13,7 @@ from messages import refuses
 from sweeps import sweep
 
 from gsmerge.errors import SceneError
-from gsmerge.kernels import elementary
+from gsmerge.method.kernels import elementary
 from gsmerge.reading.alignment.frames import UPRIGHT
 from gsmerge.reading.read_scene import Loaded, load_scene
 from gsmerge.types import SH_C0

@@ -12,8 +12,8 @@ import pytest
 from exports import smooth_scene
 from messages import noted
 
-from gsmerge.geometry.transforms import sh0_to_rgb
 from gsmerge.io.photo_files import cut_part, part_size
+from gsmerge.method.geometry.transforms import sh0_to_rgb
 from gsmerge.reading.photos.grid_fit import PartFit
 from gsmerge.reading.photos.photo_parts import list_parts
 from gsmerge.reading.read_scene import load_scene

@@ -13,10 +13,10 @@ from messages import noted, refuses
 
 from gsmerge import CompactOptions, Gaussians, Scene, compact
 from gsmerge.errors import UsageError
-from gsmerge.facts.pictures import ROW_COLORS
+from gsmerge.method.facts.pictures import ROW_COLORS
+from gsmerge.method.stages.superpixels import grid_labels
 from gsmerge.results.result import CompactResult
 from gsmerge.runtime.plugins import METHODS, find_plugins, load_plugin
-from gsmerge.stages.superpixels import grid_labels
 
 COUNT = 200
 KEEPERS = ("unmerged", "unmerged-fit")

@@ -8,7 +8,7 @@ import scenes
 from clouds import some
 
 from gsmerge import Gaussians
-from gsmerge.geometry.transforms import covariances
+from gsmerge.method.geometry.transforms import covariances
 from gsmerge.research.baselines import greedy
 
 

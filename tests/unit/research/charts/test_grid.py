@@ -13,8 +13,8 @@ from messages import refuses
 
 import gsmerge
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.geometry.views import subset
 from gsmerge.io.jsonl import append_line
+from gsmerge.method.geometry.views import subset
 from gsmerge.research.charts.grid import find_sources, list_settings, make_runs, parse_grid, scene_names
 from gsmerge.research.charts.measure_run import RUNS, ChartScene, hold_out, read_runs
 from gsmerge.scoring.evaluate import EvaluateOptions

@@ -13,8 +13,8 @@ from shared import make_once
 
 import gsmerge
 from gsmerge.errors import SceneError, UsageError
-from gsmerge.geometry.transforms import project
-from gsmerge.raster.metrics import psnr
+from gsmerge.method.geometry.transforms import project
+from gsmerge.method.raster.metrics import psnr
 from gsmerge.reading.held_out import read_held_out
 from gsmerge.reading.read_scene import load_scene
 from gsmerge.research.generate import GenerateOptions, generate

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from gsmerge import Cameras, Gaussians
-from gsmerge.geometry.transforms import project, quat_to_rotmat
-from gsmerge.kernels.elementary import log
-from gsmerge.kernels.raster.project import view_colors
+from gsmerge.method.geometry.transforms import project, quat_to_rotmat
+from gsmerge.method.kernels.elementary import log
+from gsmerge.method.kernels.raster.project import view_colors
 from gsmerge.research.generate import NoiseOptions
 from gsmerge.research.generate.noise import (
     ERRORS,

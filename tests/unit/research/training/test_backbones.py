@@ -11,8 +11,8 @@ from scenes import arc, make_scene, room
 from training_runs import OPTIONS
 
 from gsmerge import Cameras, Gaussians, Scene, Views
-from gsmerge.geometry.pixel_gaussians import make_round_gaussians, pixel_rays
-from gsmerge.geometry.transforms import camera_depths
+from gsmerge.method.geometry.pixel_gaussians import make_round_gaussians, pixel_rays
+from gsmerge.method.geometry.transforms import camera_depths
 from gsmerge.research.training import Capture, train
 
 

@@ -13,10 +13,13 @@ from scipy.ndimage import uniform_filter
 from training_runs import OPTIONS, PAPER, TINY, noisy_networks, torch, whole_photo, written
 
 from gsmerge.errors import GsmergeError
-from gsmerge.kernels.elementary import exp
-from gsmerge.networks.apply import NetworkContext
-from gsmerge.networks.options import NetworkOptions
-from gsmerge.raster import render
+from gsmerge.method.kernels.elementary import exp
+from gsmerge.method.networks.apply import NetworkContext
+from gsmerge.method.networks.options import NetworkOptions
+from gsmerge.method.raster import render
+from gsmerge.method.stages.decode import decode
+from gsmerge.method.stages.match import match
+from gsmerge.method.stages.merge import merge
 from gsmerge.research.training import Example, TrainOptions, make_example, make_training_scene, train
 from gsmerge.research.training.examples import recolor
 from gsmerge.research.training.losses import (
@@ -36,9 +39,6 @@ from gsmerge.research.training.scenes import covered_pixels, measure_covered, vi
 from gsmerge.research.training.windows import Box, Window, sample_window
 from gsmerge.scoring.lpips import lpips, lpips_available
 from gsmerge.settings.stages import DecodeOptions
-from gsmerge.stages.decode import decode
-from gsmerge.stages.match import match
-from gsmerge.stages.merge import merge
 from gsmerge.types import Cameras, Gaussians, Scene, Views
 
 PHOTO = replace(OPTIONS, window=16, validation_windows=4)

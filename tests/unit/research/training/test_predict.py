@@ -15,12 +15,12 @@ from sweeps import sweep
 from training_runs import PAPER, TINY, noisy_networks, torch, whole_photo
 
 from gsmerge.arrays import as_array
-from gsmerge.geometry.pooling import MAX_OPACITY, feature_to_gaussians, pool_members
-from gsmerge.geometry.transforms import rotmat_to_quat
-from gsmerge.kernels import elementary
-from gsmerge.networks import apply, tokens
-from gsmerge.networks.apply import NetworkContext, encode_features
-from gsmerge.networks.corrections import (
+from gsmerge.method.geometry.pooling import MAX_OPACITY, feature_to_gaussians, pool_members
+from gsmerge.method.geometry.transforms import rotmat_to_quat
+from gsmerge.method.kernels import elementary
+from gsmerge.method.networks import apply, tokens
+from gsmerge.method.networks.apply import NetworkContext, encode_features
+from gsmerge.method.networks.corrections import (
     COLOR_COLUMNS,
     LOGIT_COLUMN,
     MASS_COLUMN,
@@ -28,8 +28,10 @@ from gsmerge.networks.corrections import (
     ROTATION_COLUMNS,
     SIZE_COLUMNS,
 )
-from gsmerge.networks.options import FEATURE, NetworkOptions
-from gsmerge.networks.tensors import quat_to_rotmat
+from gsmerge.method.networks.options import FEATURE, NetworkOptions
+from gsmerge.method.networks.tensors import quat_to_rotmat
+from gsmerge.method.stages.match import match
+from gsmerge.method.stages.merge import cluster_runs, merge, pool_runs
 from gsmerge.research.training import Example, make_example, make_training_scene, preset_options
 from gsmerge.research.training.examples import draw_random_views, select_example_views
 from gsmerge.research.training.losses import teacher_loss, window_loss
@@ -44,8 +46,6 @@ from gsmerge.research.training.predict import (
     predict,
 )
 from gsmerge.research.training.windows import Crop, Window, sample_window
-from gsmerge.stages.match import match
-from gsmerge.stages.merge import cluster_runs, merge, pool_runs
 from gsmerge.types import SH_C0, FeatureGaussians, Gaussians, Matches
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -13,8 +13,8 @@ from scenes import arc, make_scene, room
 from training_runs import OPTIONS, TINY, written
 
 from gsmerge.errors import SceneError
-from gsmerge.networks.corrections import LOGIT_COLUMN
-from gsmerge.networks.options import Bounds
+from gsmerge.method.networks.corrections import LOGIT_COLUMN
+from gsmerge.method.networks.options import Bounds
 from gsmerge.reading.checkpoint import load_checkpoint
 from gsmerge.research.training import Shard, TrainOptions, make_example, preset_options, train
 from gsmerge.research.training.scenes import make_training_scene
