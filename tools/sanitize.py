@@ -41,7 +41,7 @@ RACE = 66  # exit code of a process in which the thread sanitizer reports a race
 WRITE_ONE_ARRAY = """
 import threading
 import numpy as np
-from gsmerge.kernels.raster.project import add_rows
+from gsmerge.method.kernels.raster.project import add_rows
 ids, rows, totals = np.zeros(200_000, np.int32), np.ones((200_000, 3), np.float32), np.zeros((1, 3), np.float32)
 barrier = threading.Barrier(2)
 def work():

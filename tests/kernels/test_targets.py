@@ -14,8 +14,8 @@ CODE = """
 import hashlib
 import numpy as np
 from gsmerge import Cameras, Gaussians
-from gsmerge.raster import composite, make_splats, tile_view
-from gsmerge.raster.gradient import gradients_of
+from gsmerge.method.raster import composite, make_splats, tile_view
+from gsmerge.method.raster.gradient import gradients_of
 
 rng = np.random.default_rng(5)
 for width, height, count, reach in ((37, 45, 400, -1.5), (64, 16, 3000, -2.5), (130, 70, 2000, 0.0)):
