@@ -24,6 +24,8 @@ MAIN_JOB = (
     ("gsmerge", "compact", "demo", "--overwrite"),
     ("gsmerge", "render", "demo/scene.ply", "demo/scene.compact.ply", "-o", "demo/preview.png", "--overwrite"),
 )
+# What makes pages and pictures of the code
+GENERATORS = ("docs/generate_reference.py", "docs/one_run.py", "docs/two_wings.py")
 TASKS: dict[str, tuple[tuple[str, ...], ...]] = {  # the calls of each task
     "demo": (MAKE_VENV, (*INSTALL, "."), *MAIN_JOB),
     "main-job": MAIN_JOB,  # the demo with a package that is installed already
@@ -35,8 +37,8 @@ TASKS: dict[str, tuple[tuple[str, ...], ...]] = {  # the calls of each task
     "lint": (("ruff", "check", "."), ("ruff", "format", "--check", ".")),
     "types": (("mypy", "-p", "gsmerge"),),
     "imports": (("lint-imports",),),
-    "docs": (("python", "docs/generate_reference.py", "--check"), ("python", "docs/one_run.py", "--check")),
-    "reference": (("python", "docs/generate_reference.py"), ("python", "docs/one_run.py")),
+    "docs": tuple(("python", program, "--check") for program in GENERATORS),
+    "reference": tuple(("python", program) for program in GENERATORS),
     "fuzz": (("python", "tools/fuzz.py"),),
     "sanitize": (("python", "tools/sanitize.py"),),
     "kills": (("python", "tools/kills.py"),),

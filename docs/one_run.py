@@ -315,7 +315,7 @@ def first_steps(run: Run) -> list[str]:
 
 
 def build_steps(run: Run) -> list[str]:
-    """Write the steps that build the Gaussians, the arrows of the pipeline."""
+    """Write the steps that build the Gaussians, the stages of the pipeline."""
     made, at = run.made, run.feature
     features, matches = made["correct"], made["match"]
     merged, decoded, fitted = made["merge"], made["decode_merged"], made["fit_scene"]

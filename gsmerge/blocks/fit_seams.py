@@ -115,8 +115,8 @@ def _view_weights(splats: Splats, starts: Sequence[BlockStart]) -> Iterator[tupl
     in the view. Views are numbered within the prepared scene of their block.
     """
     for block, start in enumerate(starts):
-        own_views, repeated = set(start.block.own), start.prepared.repeated
-        views = sorted({repeated[i] for i, view in enumerate(start.block.views) if view in own_views})
+        block_views, repeated = set(start.block.own), start.prepared.repeated
+        views = sorted({repeated[i] for i, view in enumerate(start.block.views) if view in block_views})
         photos = blank_photos(start.prepared.scene.cameras[views], 2)
 
         def list_weights(view: int, photos: Photos = photos) -> tuple[np.ndarray, np.ndarray]:

@@ -109,7 +109,7 @@ def plan_scores(prepared: Prepared, plan: Plan, report_views: int) -> ScorePlan:
     cameras = prepared.scene.cameras
     decides = plan.count.target_psnr is not None or plan.count.keeps_fidelity
     samples = not decides and scored_tiles(0, cameras.width, cameras.height, 2) is not None
-    views = own_views(prepared)
+    views = pictured_views(prepared)
     if not prepared.reference.placed:
         chosen = pick_views(len(views), report_views) if samples else scored_views(len(views))
         views = tuple(views[i] for i in chosen)
@@ -251,7 +251,7 @@ def resolve_decode(options: CompactOptions, scene: SceneSize) -> DecodeOptions:
     return replace(decode, k=USUAL_K if keeps_k else LONE_K)
 
 
-def own_views(prepared: Prepared) -> tuple[int, ...]:
+def pictured_views(prepared: Prepared) -> tuple[int, ...]:
     """Return the views whose pictures show the scene: views that were placed, or views of the input.
 
     Views of the input are numbered as in the input, where a view may be repeated.

@@ -128,7 +128,7 @@ def make_scene(ply: GaussianFile, placed: Placed, hints: ReadHints) -> Loaded:
         recovery=recovery,
         problem=result.problem,
         moves=result.moves,
-        own_views=result.own_views,
+        num_row_views=result.num_row_views,
         source=source,
     )
 

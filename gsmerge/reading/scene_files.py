@@ -207,9 +207,9 @@ def find_scene_files(
             raise SceneError(folder, f"expected a folder of pictures for --{option}, found a file", "name its folder")
     if path.suffix.lower() == STATE_ENDING and not os.path.isdir(path):
         check_file(path)
-        own_views = path if cameras is None and _holds_views(path) else None
-        photos = image_path or (own_views if images is None else None)
-        return SceneFiles(path, camera_path or own_views, photos, mask_path, protect, named=named)
+        views_file = path if cameras is None and _holds_views(path) else None
+        photos = image_path or (views_file if images is None else None)
+        return SceneFiles(path, camera_path or views_file, photos, mask_path, protect, named=named)
     plys, num_copies = [path], 0
     if os.path.isdir(path):
         plys = find_plys(path, camera_path)

@@ -9,7 +9,7 @@ from gsmerge.method.facts.prepared import Prepared
 from gsmerge.method.fit import Fitted
 from gsmerge.method.geometry.frame import scene_depth
 from gsmerge.method.pipelines.plan import Plan, ScorePlan
-from gsmerge.plan.make_plan import own_views
+from gsmerge.plan.make_plan import pictured_views
 from gsmerge.results.scores import compares_all_pixels, measure_renders, measure_result, round_for_output
 from gsmerge.runtime.record import Record, current_record, note, record_choices, record_part, stage
 from gsmerge.types import Cameras, Gaussians
@@ -72,7 +72,7 @@ def _measure_candidate(gaussians: Gaussians, moved: Prepared, plan: ScorePlan) -
     measured = measure_result(gaussians, moved, plan, None if plan.before is None else plan.before.covered)
     if measured is None:
         return None, None
-    record_choices(scored_views=len(plan.views), scored_all=not plan.samples and plan.views == own_views(moved))
+    record_choices(scored_views=len(plan.views), scored_all=not plan.samples and plan.views == pictured_views(moved))
     return measured.psnr, measured.psnr if compares_all_pixels(plan.before) else measured.covered_psnr
 
 

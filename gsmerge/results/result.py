@@ -19,7 +19,7 @@ from gsmerge.method.facts.pictures import OWN_PHOTOS, PHOTOS, RENDERS
 from gsmerge.method.facts.prepared import Prepared
 from gsmerge.method.pipelines.plan import Plan
 from gsmerge.method.raster.metrics import SAMPLE_LOSS, describe_distance, describe_loss, is_worse
-from gsmerge.plan.make_plan import own_views
+from gsmerge.plan.make_plan import pictured_views
 from gsmerge.results.candidate import Candidate, rescore, with_moved_views
 from gsmerge.results.distance import describe_clear_loss, is_clearly_worse
 from gsmerge.results.outputs import NUM_FULL, name_outputs, pad_harmonics, write_outputs
@@ -157,7 +157,7 @@ def make_result(best: Candidate, levels: Sequence[Candidate], prepared: Prepared
         is_worse(*compared_psnr(parts.covered, before, candidate.psnr), SAMPLE_LOSS)
         for parts, candidate in zip(part_scores, candidates, strict=True)
     ):
-        plan = replace(plan, score=replace(plan.score, views=own_views(prepared), samples=False))
+        plan = replace(plan, score=replace(plan.score, views=pictured_views(prepared), samples=False))
         best, *levels = (rescore(candidate, candidate.gaussians, prepared, plan) for candidate in candidates)
         return make_result(best, levels, prepared, plan)
     seconds = dict(best.record.seconds)

@@ -1,4 +1,4 @@
-"""The pages on the inside of the package name its rooms, files and definitions, and only those that there are."""
+"""The pages on the inside of the package name its packages, files and definitions, and only those that there are."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ def section(title: str, page: Path = ARCHITECTURE) -> str:
     return page.read_text("utf-8").partition(f"\n## {title}\n")[2].partition("\n## ")[0]
 
 
-def rooms(text: str) -> list[str]:
-    """Return the rooms of the table, in its order."""
+def names_in_table(text: str) -> list[str]:
+    """Return the packages of the table, in its order."""
     return re.findall(r"^\| `([\w/]+)` \|", text, re.MULTILINE)
 
 
@@ -40,34 +40,34 @@ def layers(name: str) -> list[str]:
     return [name for layer in contract["layers"] for name in layer.split(" | ")]
 
 
-def test_rooms_of_the_page_follow_the_import_contract() -> None:
-    assert [room.rstrip("/") for room in rooms(section("Rooms"))] == layers("Imports flow down")
-    assert [room.rstrip("/") for room in rooms(section("Method"))] == layers("Imports of the method flow down")
+def test_packages_of_the_page_follow_the_import_contract() -> None:
+    assert [name.rstrip("/") for name in names_in_table(section("Packages"))] == layers("Imports flow down")
+    assert [name.rstrip("/") for name in names_in_table(section("Method"))] == layers("Imports of the method flow down")
 
 
-def test_rooms_are_the_folders_and_modules_of_the_package() -> None:
+def test_packages_are_the_folders_and_modules_of_the_package() -> None:
     inside = {f"{path.parent.name}/" for path in PACKAGE.glob("*/__init__.py")}
     inside |= {path.stem for path in PACKAGE.glob("*.py") if not path.stem.startswith("__")}
-    listed = rooms(section("Rooms"))
+    listed = names_in_table(section("Packages"))
     assert set(listed) == inside
     assert len(listed) == len(inside)
 
 
-def arrows() -> list[list[str]]:
-    """Return the cells of the table of arrows."""
-    lines = [line for line in section("Arrows").splitlines() if line.startswith("| ")]
+def stages() -> list[list[str]]:
+    """Return the cells of the table of stages."""
+    lines = [line for line in section("Stages").splitlines() if line.startswith("| ")]
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[1:]]
 
 
-def test_table_of_arrows_follows_the_line_from_files_to_ply() -> None:
-    """Rows without a name go on with the arrow above them."""
+def test_table_of_stages_follows_the_line_from_files_to_ply() -> None:
+    """Rows without a name go on with the stage above them."""
     line = re.search(r"^    files -> (.+)$", ARCHITECTURE.read_text("utf-8"), re.MULTILINE)
     assert line is not None
-    assert [row[0] for row in arrows() if row[0]] == line[1].split(" -> ")
+    assert [row[0] for row in stages() if row[0]] == line[1].split(" -> ")
 
 
-def test_functions_in_the_table_of_arrows_are_in_the_files_beside_them() -> None:
-    for _, functions, files, _ in arrows():
+def test_functions_in_the_table_of_stages_are_in_the_files_beside_them() -> None:
+    for _, functions, files, _ in stages():
         modules = [import_module("gsmerge." + name.replace("/", ".")) for name in re.findall(r"`([\w/]+)`", files)]
         names = re.findall(r"`(\w+)`", functions)
         assert names

@@ -50,7 +50,8 @@ gaussians = Gaussians(
     sh0=rgb_to_sh0(images.reshape(num, 1, 3)), shN=np.zeros((num, 0, 3), np.float32),
 )
 cameras = Cameras(viewmats, np.tile(K, (VIEWS, 1, 1)), WIDTH, HEIGHT)
-scene = Scene(gaussians, cameras, names=("0", "1"), images=images, pixels=Pixels.of_grid(np.ones(images.shape[:3], bool)))
+pixels = Pixels.of_grid(np.ones(images.shape[:3], bool))
+scene = Scene(gaussians, cameras, names=("0", "1"), images=images, pixels=pixels)
 
 for pipeline in (PIXEL_ROWS, BARE_ROWS):
     limits = CountLimits(

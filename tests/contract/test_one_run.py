@@ -42,3 +42,8 @@ def test_a_sentence_that_is_no_longer_true_is_named(script: Any, run: Any) -> No
     )
     with pytest.raises(script.UntrueError, match="K is 1"):
         script.build_steps(longer)
+
+
+def test_the_picture_of_the_packages_follows_the_import_contracts() -> None:
+    script = load_script(PROGRAM.with_name("two_wings.py"))
+    assert script.PICTURE.read_text("utf-8") == script.draw_picture(), "run python docs/two_wings.py to renew"

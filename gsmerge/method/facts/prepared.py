@@ -65,8 +65,8 @@ class Prepared:
     @property
     def size(self) -> SceneSize:
         """Sizes of the scene that the plan depends on."""
-        own_views = self.input_scene if self.reference.placed else self.scene  # placed views do not count
-        size = measure_size(own_views, rendered=not self.reference.of_views)
+        given_views = self.input_scene if self.reference.placed else self.scene  # placed views do not count
+        size = measure_size(given_views, rendered=not self.reference.of_views)
         # Gaussians that fill holes do not count, because they are not in the file
         return replace(size, num_gaussians=min(size.num_gaussians, self.input_scene.num_gaussians))
 
