@@ -100,24 +100,27 @@ def compact(
         view_command = shlex.join(["gsmerge", "view", *map(str, on_page)])
         raise UsageError(f"{out}: exists already; {view_command} shows it, --overwrite makes it again")
     loaded = None
+    changes: list[str] = []
     if isinstance(source, Path):
         _decode_features(context, source, given, run)
     else:
         has_levels = "levels" in given.values
         try:
-            loaded = _compact_files(source, settings, writing, opt.read_hints(hint), run, has_levels=has_levels)
+            loaded, changes = _compact_files(
+                source, settings, writing, opt.read_hints(hint), run, has_levels=has_levels
+            )
         except SceneError as error:
             _print_candidates(error.candidates, run)
             raise
     if run.has_page and not dry_run:
-        _show_page(on_page, loaded, run, open=bool(open))
+        _show_page(on_page, loaded, changes, run, open=bool(open))
 
 
 def _compact_files(
     files: "SceneFiles", settings: CompactOptions, writing: FileOptions, reading: opt.Reading, run: Run, *,
     has_levels: bool,
-) -> "Loaded | None":  # fmt: skip
-    """Compact a scene, and return it as it was read; with ``--dry-run`` print an estimate instead.
+) -> "tuple[Loaded | None, list[str]]":  # fmt: skip
+    """Compact a scene; return it as it was read, and what was done to it. With ``--dry-run`` print an estimate instead.
 
     ``has_levels``: the user gave the number of levels.
     """
@@ -150,7 +153,7 @@ def _compact_files(
         with opt.usage_errors():
             estimate = estimate_files(load, settings, outputs)
         print_document(estimate, dry_run_lines(estimate), as_json=run.json)
-        return None
+        return None, []
     # Warn before reading if the scene, or the largest of its blocks, is not likely to fit into memory
     count, num_rest = estimate_counts([ply for scene_files in (files, *files.more) for ply in scene_files.plys])
     at_once = gaussians_at_once(count, wanted_blocks(settings, count))
@@ -167,10 +170,11 @@ def _compact_files(
             hashed=run.json, seconds_before=seconds_before, on_read=loads.append,
         )  # fmt: skip
     _print_candidates(loads[0].candidates, run)
-    for change in document["choices"].get("changes", ()) if run.verbose else ():
-        say(f"changed  {change}", quiet=run.quiet)
+    changes = document["choices"].get("changes", [])
+    for change in changes:
+        say(f"changed: {change}", quiet=run.silent)
     _print_result(document, run)
-    return loads[0]
+    return loads[0], changes
 
 
 def _print_candidates(candidates: "Sequence[Choice]", run: Run) -> None:
@@ -181,8 +185,10 @@ def _print_candidates(candidates: "Sequence[Choice]", run: Run) -> None:
         say(line, quiet=run.quiet)
 
 
-def _show_page(on_page: Sequence[Path], loaded: "Loaded | None", run: Run, *, open: bool) -> None:
-    """Show the result on a page, beside the scene that was ``loaded`` if ``on_page`` has both."""
+def _show_page(
+    on_page: Sequence[Path], loaded: "Loaded | None", changes: Sequence[str], run: Run, *, open: bool
+) -> None:
+    """Show the result on a page, beside the scene that was ``loaded`` if ``on_page`` has both, and its ``changes``."""
     from gsmerge.cli.view_command import show_page
     from gsmerge.io.formats.table import VIEWED
     from gsmerge.reading.scene_files import find_scene_files
@@ -194,7 +200,8 @@ def _show_page(on_page: Sequence[Path], loaded: "Loaded | None", run: Run, *, op
         show_page(find_scene_files(before), [], open=open and not run.json, quiet=run.silent)
     else:
         loaded = replace(loaded, notes=())  # its notes have been printed already
-        show_page(loaded.files, after, loaded=loaded, open=open and not run.json, quiet=run.silent)
+        is_opened = open and not run.json
+        show_page(loaded.files, after, loaded=loaded, changes=changes, open=is_opened, quiet=run.silent)
 
 
 def _print_result(document: Mapping[str, Any], run: Run) -> None:

@@ -281,5 +281,5 @@ OwnThreads = Annotated[
 Progress = Annotated[str | None, choice(GENERAL, ("bar", "json"), "json: print a line for each step on stderr, with "
     "the seconds left.", "bar")]  # fmt: skip
 Verbose = Annotated[bool, option(GENERAL, "", "Also print which cameras, photos and masks were tried, and why they are "
-    "used or left out, and what the run changed of them.", "--verbose", "-v")]  # fmt: skip
+    "used or left out.", "--verbose", "-v")]  # fmt: skip
 Quiet = Annotated[bool, option(GENERAL, "", "Print errors only.", "--quiet", "-q")]

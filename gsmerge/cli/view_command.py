@@ -2,6 +2,7 @@
 
 import os
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -40,11 +41,14 @@ def view(
 
 
 def show_page(
-    files: "SceneFiles", after: list[Path], output: Path | None = None, reading: opt.Reading = opt.Reading(), *,
-    loaded: "Loaded | None" = None, targets: Path | None = None, light: bool = False, open: bool = True,
-    overwrite: bool = False, json: bool = False, quiet: bool = False,
+    files: "SceneFiles", after: list[Path], output: Path | None = None, reading: opt.Reading = opt.Reading(), *, loaded:
+    "Loaded | None" = None, changes: Sequence[str] = (), targets: Path | None = None, light: bool = False, open: bool =
+    True, overwrite: bool = False, json: bool = False, quiet: bool = False,
 ) -> None:  # fmt: skip
-    """Make the page of a scene, which may be ``loaded`` already, and of its compact versions; open it if ``open``."""
+    """Make the page of a scene, which may be ``loaded`` already, and of its compact versions; open it if ``open``.
+
+    ``changes`` says what a run did to photos, cameras and Gaussians before it merged them.
+    """
     from gsmerge.drawing.pages.data import collect_page_data
     from gsmerge.drawing.pages.page import headline, speed, speed_words, view_page
     from gsmerge.drawing.pages.view import check_page_name, file_gains
@@ -65,7 +69,7 @@ def show_page(
         sizes = [pair.load.info.file_bytes, *(ply.info.file_bytes for ply in pair.plys.values())]
         data = collect_page_data(
             pair.title, pair.scene, pair.gaussians, sizes, pair.held_out, cameras=pair.cameras,
-            new_gains=file_gains(pair.plys), light=light, progress=progress,
+            new_gains=file_gains(pair.plys), changes=changes, light=light, progress=progress,
         )  # fmt: skip
     page = view_page(data)
     write_texts({output: page}, mode)

@@ -169,15 +169,20 @@ def _describe_scene(load: Loaded, *, is_result: bool) -> dict[str, Any]:
     scene = load.scene
     distinct = without_repeats(scene)[0]  # each view once, as in a run
     # A run takes these steps, too, with these sizes and these notes on sizes and photos
-    canonical, names = distinct, ("finite", "views", "frame", "sizes")
+    canonical = distinct
+    changes: tuple[str, ...] = ()
+    names = ("finite", "views", "frame", "sizes")
     with record_part(silent=True) as record:
         if len(distinct.gaussians) > 0:
             steps = select(*names, "pixels", "photos") if len(distinct) else select(*names)
-            canonical = take_steps(steps, begin(distinct)).scene
+            prepared = take_steps(steps, begin(distinct))
+            canonical = prepared.scene
+            changes = prepared.changes
     agreement, doubt = confirm_depths(canonical), unlike_captures(canonical.gaussians)
     doubts = doubt and Doubt(doubt), agreement.advice if agreement else None
+    notes = [*load.notes, *views_notes(scene), *record.notes, *changes, *doubts]
     facts: dict[str, Any] = {
-        **note_entries(list(dict.fromkeys(filter(None, [*load.notes, *views_notes(scene), *record.notes, *doubts])))),
+        **note_entries(list(dict.fromkeys(filter(None, notes)))),
         "num_views": len(scene),
         "camera_format": load.cameras and load.cameras.source,
         "coverage": coverage(scene),

@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsmerge.errors import Doubt
+from gsmerge.errors import Doubt, count_words
 from gsmerge.method.compare.assign_photos import Assigner, Candidates
 from gsmerge.method.compare.colors import (
     EXPOSURE_STEP,
@@ -61,17 +61,17 @@ GREY_VARIATION = 0.25  # a photo is grey if its hues vary by less than this shar
 STRAY_PHOTOS = "do not show what the Gaussians show"  # in notes, of photos that are not used
 
 
-def compare_photos(scene: PicturedScene, look: Look = "auto") -> tuple[PicturedScene, tuple[int, ...]]:
+def compare_photos(scene: PicturedScene, look: Look = "auto") -> tuple[PicturedScene, tuple[int, ...], list[str]]:
     """Correct the photos of a canonical scene, and replace photos, or parts of them, that do not show it.
 
-    Returns the scene and the views whose photos show it. No view is returned if most photos do not show the scene, or
-    if the photos have another look, such as exchanged red and blue. With ``look`` "photos", all photos count unchanged.
-    With ``look`` "scene", no photo counts. The record gets notes and the choices ``photos_changed`` and
-    ``photos_left_out``.
+    Returns the scene, the views whose photos show it, and a sentence for each kind of change. No view is returned if
+    most photos do not show the scene, or if the photos have another look, such as exchanged red and blue. With ``look``
+    "photos", all photos count unchanged. With ``look`` "scene", no photo counts. The record gets notes and the choices
+    ``photos_changed`` and ``photos_left_out``.
     """
     photo_views = scene.photo_views
     if look != "auto" or not photo_views:
-        return scene, tuple(photo_views) if look != "scene" else ()
+        return scene, tuple(photo_views) if look != "scene" else (), []
     pairs = pair_photos(scene, scene.images)
     grey = find_grey(pairs, photo_views)
     if grey:
@@ -85,7 +85,7 @@ def compare_photos(scene: PicturedScene, look: Look = "auto") -> tuple[PicturedS
             problem = "red and blue are exchanged between Gaussians and photos: either f_dc_0 and f_dc_2 of the file or"
             problem += " the photos are in the order blue, green, red; the scene keeps its own colours"
         note(Doubt(f"{problem}; --set look=photos gives it the look of the photos"))
-        return scene, ()
+        return scene, (), []
     stray = [view for view in photo_views if view not in matching]
     if stray:
         names = [scene.names[view] for view in stray]
@@ -96,8 +96,8 @@ def compare_photos(scene: PicturedScene, look: Look = "auto") -> tuple[PicturedS
             result = f", so no photo is used: {listed}; check their names and order"
         note(Doubt(f"{len(stray)} of {len(photo_views)} photos {STRAY_PHOTOS}{result}"))
         if not are_few:
-            return scene, ()
-    changes = correct_tones(scene, pairs, matching)
+            return scene, (), []
+    changes, toned = correct_tones(scene, pairs, matching)
     hidden, pictures = np.zeros(scene.images.shape[:3], bool), None
     if scene.has_own_pixels:
         hidden, pictures = _find_hidden(scene, changes)
@@ -105,17 +105,25 @@ def compare_photos(scene: PicturedScene, look: Look = "auto") -> tuple[PicturedS
     changed = [view for view in matching if hidden[view].any() or changes[view] or view in grey]
     if changed:
         record_choices(photos_changed=[scene.names[view] for view in changed])
-    return _change_photos(scene, changes, hidden, pictures, matching), tuple(matching)
+    num_covered = sum(bool(hidden[view].any()) for view in matching)
+    said = [toned] if toned else []
+    if grey:
+        said.append(f"{count_words(len(grey), 'grey photo')} got the hues of the Gaussians")
+    if num_covered:
+        share = 100 * max(float(hidden[view].mean()) for view in matching)
+        covered = f"{count_words(num_covered, 'photo')} covered with the Gaussians' colours where they differ"
+        said.append(f"{covered}, up to {share:.2g} % of a photo")
+    return _change_photos(scene, changes, hidden, pictures, matching), tuple(matching), said
 
 
-def correct_tones(scene: PicturedScene, pairs: Pairs, views: Sequence[int]) -> list[PhotoChange]:
+def correct_tones(scene: PicturedScene, pairs: Pairs, views: Sequence[int]) -> tuple[list[PhotoChange], str]:
     """Find, for each of ``views``, the tone curve ``[3,256]`` from its photo to its Gaussians.
 
-    Returns the change of each photo of the scene, and makes a note if tones differ. If the pictures of the Gaussians
-    are drawings, all photos share a curve. If no photo changes by more than :data:`EXPOSURE_STEP`, no curve counts,
-    because models themselves change tones slightly. A curve counts only if the inverse curve, from Gaussians to photos,
-    reduces errors, too. The inverse curve reduces no errors if photos and Gaussians differ by noise, which flattens the
-    colours of Gaussians.
+    Returns the change of each photo of the scene, and a sentence about tones that differ. If the pictures of the
+    Gaussians are drawings, all photos share a curve. If no photo changes by more than :data:`EXPOSURE_STEP`, no curve
+    counts, because models themselves change tones slightly. A curve counts only if the inverse curve, from Gaussians to
+    photos, reduces errors, too. The inverse curve reduces no errors if photos and Gaussians differ by noise, which
+    flattens the colours of Gaussians.
     """
     curves, is_large = dict[int, np.ndarray](), False
     stored = cut_blocks(pairs)
@@ -129,16 +137,16 @@ def correct_tones(scene: PicturedScene, pairs: Pairs, views: Sequence[int]) -> l
             curve = fit_tones(colors, targets, pairs.shown.weights[group].reshape(-1))
             curves |= dict.fromkeys(group, curve)
     if not is_large or (pairs.shown.drawn and not have_other_tones(scene, views)):
-        return [PhotoChange()] * len(pairs)
+        return [PhotoChange()] * len(pairs), ""
     middle_grey = 128  # level of 255 at which notes report the change of tone
     factors = [float(curve[:, middle_grey].mean()) / (middle_grey / 255) for curve in curves.values()]
     low, high = min(factors), max(factors)
     factor = f"{low:.2f}" if high - low < 0.01 else f"{low:.2f} to {high:.2f}"
-    note(
+    change = (
         f"{len(curves)} of {len(views)} photos have another tone than their Gaussians (exposure, gamma or linear"
         f" light), which is corrected; middle grey times {factor}: {list_some([scene.names[view] for view in curves])}"
     )
-    return [PhotoChange(curves.get(view)) for view in range(len(pairs))]
+    return [PhotoChange(curves.get(view)) for view in range(len(pairs))], change
 
 
 def find_grey(pairs: Pairs, views: Sequence[int]) -> dict[int, float]:

@@ -15,7 +15,6 @@ from gsmerge.method.raster import render
 from gsmerge.method.raster.photos import COVERED_TRANSMITTANCE, counting_pixels
 from gsmerge.prepare.fill_holes import find_bare, large_parts
 from gsmerge.prepare.photo_change import PhotoChange, change_large
-from gsmerge.runtime.record import note
 from gsmerge.types import PicturedScene
 
 # These radii are in widths of a Gaussian, see measure_unit. Left-out pixels are empty in holes of the input of at least
@@ -29,17 +28,18 @@ LEAST_ALIKE = 0.95  # least share of the pixels of a uniform background that dif
 SOLID = 0.95  # opacity of a picture from which on it shows an object, and not Gaussians that reach over its edge
 
 
-def mask_background(scene: PicturedScene) -> PicturedScene:
+def mask_background(scene: PicturedScene) -> tuple[PicturedScene, str]:
     """Leave out the uniform background of photos of an object, which is where the input shows nothing.
 
-    Its pixels get the mean colour of the object. A cropped scene is part of a place, of which photos show more.
+    Also returns a sentence that says so. The pixels get the mean colour of the object. A cropped scene is part of a
+    place, of which photos show more.
     """
     if scene.region is not None:
-        return scene
+        return scene, ""
     bare, counts, num_views = find_bare(scene), counting_pixels(scene), 0
     parts = {view: part for view in range(len(scene)) if (part := large_parts(bare[view]) & counts[view]).any()}
     if not parts:
-        return scene
+        return scene, ""
     unit, counts, images = measure_unit(scene), counts.copy(), [*scene.images]
     importance = np.ones(counts.shape, np.float32) if scene.importance is None else scene.importance.copy()
     for view, part in parts.items():
@@ -59,9 +59,11 @@ def mask_background(scene: PicturedScene) -> PicturedScene:
             images[view] = np.where(counts[view][..., None], photo, inner)
             num_views += 1
     if not num_views:
-        return scene
-    note(f"{num_views} of {len(scene)} photos show one colour where the scene shows nothing; it counts as transparent")
-    return replace(scene, masks=counts, images=np.stack(images), importance=importance)
+        return scene, ""
+    change = (
+        f"{num_views} of {len(scene)} photos show one colour where the scene shows nothing: it counts as transparent"
+    )
+    return replace(scene, masks=counts, images=np.stack(images), importance=importance), change
 
 
 def draw_left_out(scene: PicturedScene, masks: np.ndarray | None) -> PicturedScene:

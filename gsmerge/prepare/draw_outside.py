@@ -21,7 +21,7 @@ from gsmerge.method.raster.images import thin_out
 from gsmerge.method.raster.photos import NEAR_PLANE, blank_photos, counting_pixels, photo_errors
 from gsmerge.method.viewpoints.place_cameras import CANDIDATE_GAUSSIANS, PROBE, choose_candidates
 from gsmerge.prepare.true_pixels import find_pixels
-from gsmerge.runtime.record import note, record_choices
+from gsmerge.runtime.record import record_choices
 from gsmerge.types import Cameras, Gaussians, PicturedScene, Pixels, make_scene
 
 # Cameras are placed if views miss at least this share of the Gaussians. A placed camera is used if at least this share
@@ -34,15 +34,15 @@ SOURCES, STEPS_BACK = 4, 8  # number of views beside which cameras are placed, a
 BESIDE_LOW, BESIDE_HIGH = (0.2, -20.0, -15.0), (1.0, 20.0, 15.0)
 
 
-def draw_outside(scene: PicturedScene) -> PicturedScene:
-    """Add pictures of the input from placed cameras, with a note, if the views miss a part of the Gaussians.
+def draw_outside(scene: PicturedScene) -> tuple[PicturedScene, str]:
+    """Add pictures of the input from placed cameras if the views miss a part of the Gaussians; also say so.
 
     The placed cameras come last. Their pixels count only if they show mainly Gaussians that no view sees. The scene is
     canonical, and its rows belong to no pixels. The scene is returned unchanged if its views miss too few Gaussians.
     """
     outside = scene.get_pixels().homes < 0
     if outside.mean() < LEAST_OUTSIDE or outside.all():  # if all are outside, the cameras are wrong
-        return scene
+        return scene, ""
     placed = _place_beside(scene.gaussians, outside, scene.cameras)
     white = np.repeat(outside.astype(np.float32)[:, None], 3, 1)  # all other Gaussians are black
 
@@ -53,13 +53,13 @@ def draw_outside(scene: PicturedScene) -> PicturedScene:
     counting = np.stack(photo_errors(scene.gaussians, blank_photos(placed), is_outside, colors=white))
     useful = np.flatnonzero(counting.mean((1, 2)) > LEAST_OUTSIDE)
     if len(useful) == 0:
-        return scene
+        return scene, ""
     placed, counting = placed[useful], counting[useful]
     places = count_words(len(placed), "place", "beside the views")
     unseen = f"no view sees {100 * outside.mean():.0f} % of the Gaussians"
-    note(f"{unseen}; pictures of the input from {places} stand for photos there")
+    change = f"{unseen}: pictures of the input from {places} stand for photos there"
     record_choices(placed_views=len(placed))
-    return _with_drawings(scene, placed, counting)
+    return _with_drawings(scene, placed, counting), change
 
 
 def _place_beside(gaussians: Gaussians, outside: np.ndarray, cameras: Cameras) -> Cameras:

@@ -70,27 +70,27 @@ class _Pair:
     count: int  # number of pixels
 
 
-def equalise_exposure(scene: PicturedScene, views: Sequence[int], exposure: Exposure) -> PicturedScene:
+def equalise_exposure(scene: PicturedScene, views: Sequence[int], exposure: Exposure) -> tuple[PicturedScene, str]:
     """Divide each view's photo and its pixels' Gaussians by the exposure gain of the view, if that is needed.
 
     The photos of ``views`` show the scene, and each Gaussian belongs to one view. Clipped pixels of brighter photos no
-    longer count if another photo shows their surface unclipped. The record of the run gets a note and the choice
-    ``exposure``, the gain of each view in red, green and blue. If exposures differ but photos stay unchanged, a note
-    says why.
+    longer count if another photo shows their surface unclipped. Also returns a sentence that says so, "" if nothing
+    changes. The record of the run gets the choice ``exposure``, the gain of each view in red, green and blue. If
+    exposures differ but photos stay unchanged, a note says why.
     """
     if exposure == "fixed" or len(views) < 2:
-        return scene
+        return scene, ""
     pairs = _measure_pairs(scene, views)
     gains = _solve_gains(pairs, len(scene))
     factors = exp(gains).round(3)
     low, high = factors.min(), factors.max()
     if low == high:
-        return scene
+        return scene, ""
     differ = f"the same surfaces differ in brightness by factors of {low:.2f} to {high:.2f} between photos"
     if exposure == "auto":
         view_gains, photos = gains[list(views)], [scene.images[view][::COARSE_STEP, ::COARSE_STEP] for view in views]
         if root_mean_square(view_gains) < DIFFERENT:
-            return scene
+            return scene, ""
         brightness = log(np.maximum([photo.mean((0, 1), dtype=np.float64) for photo in photos], 1 / 255))
         objection = ""
         if is_metered(brightness, view_gains):
@@ -100,10 +100,10 @@ def equalise_exposure(scene: PicturedScene, views: Sequence[int], exposure: Expo
         if objection:
             remedy = "--set exposure=per-photo brings them to their mean exposure"
             note(f"{differ}; photos stay unchanged, because {objection}; {remedy}")
-            return scene
+            return scene, ""
     record_choices(exposure=factors.tolist())
-    note(f"{differ}; photos are brought to their mean exposure")
-    return _divide_by_gains(scene, factors)
+    change = f"{differ}: photos, and the Gaussians of their pixels, are brought to their mean exposure"
+    return _divide_by_gains(scene, factors), change
 
 
 def root_mean_square(gains: np.ndarray) -> float:

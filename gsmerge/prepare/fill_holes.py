@@ -53,7 +53,7 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = Fa
     if most of the pixels are empty, because photos may show more than the scene. Large connected parts of a view
     without Gaussians stay empty, because the scene may have been cut out, or its model may have left out the sky. With
     ``everywhere``, large empty parts are filled, too. In a cropped scene, all pixels without Gaussians stay empty.
-    Notes say what was filled and what stays empty.
+    A note says what stays empty.
     """
     fronts, is_cropped, beyond = scene.get_pixels().fronts, scene.region is not None, scene.beyond
     fillable = shown & (fronts < 0)  # pixels with a picture and without a Gaussian
@@ -96,10 +96,6 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = Fa
         if scene.region is not None:
             inside = lies_inside(scene.region, added.means)
             added, pixels = added[inside], pixels[inside]
-        if len(pixels):
-            note(
-                f"{len(added):,} pixels that no Gaussian covers enough get Gaussians with the colours of their pictures"
-            )
         scene = fill_pixels(scene, added, pixels)
     return _leave_empty(scene, empty)
 

@@ -35,11 +35,11 @@ ROW_BLUR_PIXELS = 8.0
 T = TypeVar("T")
 
 
-def add_row_colors(scene: Scene, *, has_photos: bool = False) -> PicturedScene:
-    """Use the colours of each view's own Gaussians as the photos of a canonical scene, with a note.
+def add_row_colors(scene: Scene, *, has_photos: bool = False) -> tuple[PicturedScene, str]:
+    """Use the colours of each view's own Gaussians as the photos of a canonical scene.
 
-    ``has_photos`` means that the scene has photos, but an earlier note has said that they do not count. With
-    ``has_photos``, a note is made only if drawings are used.
+    With ``has_photos``, the scene has photos that do not count, and the sentence that is also returned says what is
+    used in their place. Without photos, a note says it.
     """
     shape = len(scene), scene.cameras.height, scene.cameras.width
     images, masks = np.zeros((*shape, 3), np.float32), np.full(shape, False)
@@ -52,9 +52,10 @@ def add_row_colors(scene: Scene, *, has_photos: bool = False) -> PicturedScene:
     num_drawn = sum(picture_rows(scene, store))
     share = num_drawn / masks.size
     detail = f"; drawings of the Gaussians on {100 * share:.0f} % of the pixels" if share > 1 - WHOLE_SHARE else ""
-    if detail or not has_photos:
-        note((f"photos do not count: {ROW_COLORS} are used instead" if has_photos else NO_PHOTOS) + detail)
-    return PicturedScene.with_pictures(scene, images, None if masks.all() else masks)
+    change = f"photos do not count: {ROW_COLORS} are used instead{detail}" if has_photos else ""
+    if not has_photos:
+        note(NO_PHOTOS + detail)
+    return PicturedScene.with_pictures(scene, images, None if masks.all() else masks), change
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,7 @@ from gsmerge.method.facts.pictures import PHOTOS, RENDERS, ROW_COLORS
 from gsmerge.method.facts.prepared import Prepared, Reference, with_photos
 from gsmerge.method.geometry.frame import Frame, canonicalise
 from gsmerge.method.raster.photos import counting_pixels
-from gsmerge.method.viewpoints.place_cameras import HELD_OUT, draw_pictures, keep_finite, place_views
+from gsmerge.method.viewpoints.place_cameras import HELD_OUT, describe_dropped, draw_pictures, keep_finite, place_views
 from gsmerge.prepare.compare_photos import compare_photos
 from gsmerge.prepare.confirm_depths import confirm_depths
 from gsmerge.prepare.draw_left_out import draw_left_out, mask_background
@@ -76,18 +76,16 @@ def without(*names: str) -> tuple[Step, ...]:
 
 
 def drop_repeats(p: Prepared, _: PrepareOptions) -> Prepared:
-    """Keep one of several views that are equal in every pixel, with a note."""
+    """Keep one of several views that are equal in every pixel."""
     scene, repeated, notes = without_repeats(p.scene)
-    for text in notes:
-        note(text)
     return p.after("".join(notes), scene=scene, repeated=tuple(repeated))
 
 
 def drop_nonfinite(p: Prepared, _: PrepareOptions) -> Prepared:
-    """Leave out Gaussians that are not finite, with a note."""
+    """Leave out Gaussians that are not finite."""
     scene = keep_finite(p.scene)
     count = len(p.scene.gaussians) - len(scene.gaussians)
-    return p.after(f"{count_words(count, 'Gaussian')} not finite: left out" if count else "", scene=scene)
+    return p.after(describe_dropped(count) if count else "", scene=scene)
 
 
 def place_missing_views(p: Prepared, _: PrepareOptions) -> Prepared:
@@ -95,7 +93,7 @@ def place_missing_views(p: Prepared, _: PrepareOptions) -> Prepared:
     if len(p.scene):
         return p
     scene = place_views(p.scene)
-    return p.after(f"no cameras: {len(scene)} views were placed", scene=scene, reference=Reference("", (), placed=True))
+    return p.after("", scene=scene, reference=Reference("", (), placed=True))
 
 
 def enter_frame(p: Prepared, _: PrepareOptions) -> Prepared:
@@ -105,9 +103,8 @@ def enter_frame(p: Prepared, _: PrepareOptions) -> Prepared:
 
 
 def raise_tiny_sizes(p: Prepared, _: PrepareOptions) -> Prepared:
-    """Raise the sizes of Gaussians that the low-pass hides, with a note."""
-    scene = raise_sizes(p.scene, placed=p.reference.placed)
-    change = "" if scene is p.scene else "Gaussians far smaller than a pixel got about half its size"
+    """Raise the sizes of Gaussians that the low-pass hides."""
+    scene, change = raise_sizes(p.scene, placed=p.reference.placed)
     return p.after(change, scene=scene)
 
 
@@ -118,9 +115,8 @@ def leave_out_background(p: Prepared, options: PrepareOptions) -> Prepared:
     """
     if p.scene.images is None or options.extent == "photos" or options.look == "scene":
         return p
-    scene = mask_background(PicturedScene.with_pictures(p.scene, p.scene.images, p.scene.masks))
-    count = _count_changed(p.scene.images, scene.images)
-    return p.after(f"{count_words(count, 'photo')}: the plain background is left out" if count else "", scene=scene)
+    scene, change = mask_background(PicturedScene.with_pictures(p.scene, p.scene.images, p.scene.masks))
+    return p.after(change, scene=scene)
 
 
 def use_photos(p: Prepared, options: PrepareOptions) -> Prepared:
@@ -128,13 +124,11 @@ def use_photos(p: Prepared, options: PrepareOptions) -> Prepared:
     if p.scene.images is None:
         return p
     pictured = PicturedScene.with_pictures(p.scene, p.scene.images, p.scene.masks)
-    scene, views = compare_photos(pictured, options.look)
+    scene, views, changes = compare_photos(pictured, options.look)
     if not views:
         return p
-    count = _count_changed(pictured.images, scene.images)
-    change = f"{count_words(count, 'photo')} corrected, or covered where the Gaussians show something else"
     reference = Reference(PHOTOS, views, photo_files=p.reference.photo_files)
-    return p.after(change if count else "", scene=scene, reference=reference)
+    return p.after("; ".join(changes), scene=scene, reference=reference)
 
 
 def use_row_colors(p: Prepared, _: PrepareOptions) -> Prepared:
@@ -142,8 +136,7 @@ def use_row_colors(p: Prepared, _: PrepareOptions) -> Prepared:
     if p.reference.name or not p.scene.has_own_pixels:
         return p
     has_photos = p.scene.images is not None
-    scene = add_row_colors(_without_photos(p), has_photos=has_photos)
-    change = f"photos do not show the Gaussians: {ROW_COLORS} are used in their place" if has_photos else ""
+    scene, change = add_row_colors(_without_photos(p), has_photos=has_photos)
     return p.after(change, scene=scene, reference=Reference(ROW_COLORS, tuple(range(len(scene)))))
 
 
@@ -154,14 +147,13 @@ def use_renders(p: Prepared, _: PrepareOptions) -> Prepared:
     has_photos = p.scene.images is not None
     placed = p.reference.placed
     every = tuple(range(len(p.scene)))
-    reason = "photos do not count" if has_photos else "no photos, and the rows are not the pixels of the views"
-    remedy = "" if has_photos else "; name photos with --images"
-    if not placed:  # if views were placed, another note has said this
-        note(f"{reason}: renders of the scene itself are used instead{remedy}")
+    if not (placed or has_photos):  # if views were placed, another note has said this
+        problem = "no photos, and the rows are not the pixels of the views"
+        note(f"{problem}: renders of the scene itself are used instead; name photos with --images")
     drawn = draw_pictures(_without_photos(p))
     scored = every[: len(every) // HELD_OUT] if placed else every
     shown = tuple(view for view in scored if drawn.images[view].any())  # any result is right in an empty view
-    change = f"photos do not show the Gaussians: {RENDERS} are used in their place" if has_photos else ""
+    change = f"photos do not count: {RENDERS} are used instead" if has_photos else ""
     return p.after(change, scene=drawn, reference=Reference(RENDERS, shown or scored, placed))
 
 
@@ -176,8 +168,7 @@ def equalise_exposures(p: Prepared, options: PrepareOptions) -> Prepared:
     """Bring photos, and the Gaussians of their pixels, to one exposure if exposures differ at random."""
     if not p.scene.has_own_pixels:
         return p
-    scene = equalise_exposure(p.scene, p.reference.score_views, options.exposure)
-    change = "" if scene is p.scene else "photos, and the Gaussians of their pixels, brought to their mean exposure"
+    scene, change = equalise_exposure(p.scene, p.reference.score_views, options.exposure)
     return p.after(change, scene=scene)
 
 
@@ -188,7 +179,9 @@ def move_wrong_poses(p: Prepared, options: PrepareOptions) -> Prepared:
     scene = move_poses(p.scene, p.reference.score_views, always=options.poses == "free")
     if scene is None:
         return p
-    return p.after("cameras, and the Gaussians of their pixels, moved to where photos agree", scene=scene, moved=True)
+    count = sum(map(np.any, scene.cameras.viewmats != p.scene.cameras.viewmats))
+    change = f"{count} of {len(scene)} cameras, and the Gaussians of their pixels, moved to where photos agree"
+    return p.after(change, scene=scene, moved=True)
 
 
 def keep_changed_files(p: Prepared, _: PrepareOptions) -> Prepared:
@@ -223,9 +216,11 @@ def fill_scene(p: Prepared, options: PrepareOptions) -> Prepared:
     filled = fill_holes(p.scene, shown, everywhere=options.extent == "photos")
     scene = draw_left_out(replace(filled, depths=None), masks)
     count = len(scene.gaussians) - len(p.scene.gaussians)
-    changes = [f"{count_words(count, 'Gaussian')} added at pixels that no Gaussian covered"] if count else []
-    if _count_changed(p.scene.images, scene.images):
-        changes.append("pixels at which photos do not count show the Gaussians, or nothing")
+    changes = [f"{count_words(count, 'Gaussian')} added at pixels that no Gaussian covered enough"] if count else []
+    num_changed = _count_changed(p.scene.images, scene.images)
+    if num_changed:
+        where = f"in {num_changed} of {len(scene)} pictures, pixels at which photos do not count"
+        changes.append(f"{where} show the Gaussians, or nothing")
     return p.after("; ".join(changes), scene=scene)
 
 
@@ -240,14 +235,13 @@ def score_shown_views(p: Prepared, _: PrepareOptions) -> Prepared:
 
 
 def draw_unseen(p: Prepared, _: PrepareOptions) -> Prepared:
-    """Add pictures of Gaussians that no view sees, with a note, so that a fit keeps them."""
+    """Add pictures of Gaussians that no view sees, so that a fit keeps them."""
     if p.scene.has_own_pixels or p.reference.placed:
         return p
-    drawn = draw_outside(p.scene)
+    drawn, change = draw_outside(p.scene)
     reference = p.reference
     if drawn is p.scene:
         return p
-    change = f"{count_words(len(drawn) - len(p.scene), 'picture')} drawn of Gaussians that no view sees"
     if reference.name == RENDERS:  # all pixels of all pictures are drawings
         views = (*reference.score_views, *range(len(p.scene), len(drawn)))
         drawn = replace(drawn, masks=None)

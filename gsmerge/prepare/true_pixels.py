@@ -24,7 +24,6 @@ from gsmerge.method.kernels.raster.binning import depth_order
 from gsmerge.method.raster.images import ONE_AT_A_TIME
 from gsmerge.method.raster.photos import NEAR_PLANE
 from gsmerge.method.raster.tiled_view import EPS2D
-from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import in_turn
 from gsmerge.types import Pixels, Scene, SceneT
 
@@ -47,8 +46,8 @@ def with_pixels(scene: SceneT) -> SceneT:
     return scene if scene.pixels is not None else replace(scene, pixels=find_pixels(scene))
 
 
-def raise_sizes(scene: SceneT, *, placed: bool = False) -> SceneT:
-    """Return a canonical scene in which Gaussians that the low-pass hides have the size of the low-pass, with a note.
+def raise_sizes(scene: SceneT, *, placed: bool = False) -> tuple[SceneT, str]:
+    """Return a canonical scene in which Gaussians that the low-pass hides have its size, and a sentence about them.
 
     Gaussians that share a pixel may be smaller than it, because each shows a part of the pixel. They do not count as
     hidden, because otherwise sound scenes with few pixels would change. If the cameras were ``placed``, sizes are
@@ -57,29 +56,29 @@ def raise_sizes(scene: SceneT, *, placed: bool = False) -> SceneT:
     """
     g, cameras, by_distance = scene.gaussians, scene.cameras, placed and len(scene.gaussians) > 1
     if cameras.antialiased and scene.images is None:
-        return scene
+        return scene, ""
     homes = np.full(len(g), -1) if scene.pixels is None else scene.pixels.homes
     step = max(1, len(g) // ESTIMATE_GAUSSIANS)
     units = measure_pixel_sizes(g.means[::step], homes[::step], cameras)
     if by_distance:  # the Gaussians of a sample are farther apart than all Gaussians
         units = np.minimum(units, find_nearest(g.means[::step], 1)[1][:, 0] / math.sqrt(step))
     if (g.scales[::step].max(1) < HIDDEN_SIZE * LOW_PASS * units).mean() < FEWEST_HIDDEN:
-        return scene
+        return scene, ""
     units = find_nearest(g.means, 1)[1][:, 0] if by_distance else measure_pixel_sizes(g.means, homes, cameras)
     sizes, seen = g.scales.max(1), (homes >= 0) | by_distance
     num_sharing = 1 if by_distance else np.where(seen, np.bincount(homes + 1)[homes + 1], 1)
     is_near = units < 1  # sizes are not compared with pixels as large as the scene's median depth, or larger
     hidden = (sizes * np.sqrt(num_sharing) < HIDDEN_SIZE * LOW_PASS * units) & is_near
     if np.count_nonzero(hidden & seen) <= FEWEST_HIDDEN * np.count_nonzero(seen):
-        return scene
+        return scene, ""
     share, usual = 100 * hidden.mean(), np.median(sizes[hidden] / units[hidden])
-    note(
+    change = (
         f"{share:.0f} % of the Gaussians are far smaller than"
         f" {'the distance to the next one' if by_distance else 'a pixel of the views'}, about {usual:.1g} of it;"
         " they count as half of it, about as large as they look"
     )
     scales = np.where(hidden[:, None], LOW_PASS * units[:, None], g.scales).astype(np.float32)
-    return replace(scene, gaussians=replace(g, scales=scales))
+    return replace(scene, gaussians=replace(g, scales=scales)), change
 
 
 def find_pixels(scene: Scene) -> Pixels:

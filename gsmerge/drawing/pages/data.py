@@ -80,6 +80,7 @@ class ViewData:
     lacks_pixels: bool = False  # if True, the scene itself does not cover all pixels of the input views
     agreement: Agreement | None = None  # share of the depth that other views confirm; None: not known
     cut_out: bool = False  # if True, the scene shows nothing in large parts of a view
+    changes: tuple[str, ...] = ()  # what was done to photos, cameras and Gaussians before merging, a sentence for each
 
     @property
     def shown(self) -> tuple[PageView, ...]:
@@ -120,6 +121,7 @@ def collect_page_data(
     *,
     cameras: Mapping[str, Cameras] | None = None,
     new_gains: Mapping[str, float] | None = None,
+    changes: Sequence[str] = (),
     light: bool = False,
     progress: Progress = lambda *_: None,
 ) -> ViewData:
@@ -128,7 +130,8 @@ def collect_page_data(
     ``results`` are Gaussians by name in the scene's world, and may be empty. ``file_bytes`` are the file sizes of the
     scene and of the results. Stills and scores use ``cameras`` (see :func:`gsmerge.evaluate`); 3D uses the scene's
     cameras. ``new_gains`` says, by result, how many dB better new views are expected to be. For a result that is worse
-    than the scene, no gain is shown. If ``light``, the scene itself is shown in stills only.
+    than the scene, no gain is shown. ``changes`` says what a run did to its input before it merged. If ``light``, the
+    scene itself is shown in stills only.
     """
     stills: Stills = {}
     cut_out = set[tuple[str, int]]()  # split and number of the views in large parts of which the scene shows nothing
@@ -167,7 +170,7 @@ def collect_page_data(
                 " left out; is it a result of this scene?"
             )
         sides.append(replace(side, new_gain=gain))
-    return replace(data, sides=tuple(sides), notes=(*data.notes, *notes))
+    return replace(data, sides=tuple(sides), notes=(*data.notes, *notes), changes=tuple(changes))
 
 
 def _fill_page(

@@ -117,12 +117,14 @@ def view(
         if (moved := getattr(result, "cameras", None)) is not None
         and len(moved) == len(shown_scene) == len(input_scene)
     }
+    reports = [getattr(result, "report", None) for result in named.values()]
+    changes = list(dict.fromkeys(text for report in reports if report for text in report.choices.get("changes", ())))
     max_solid = 600_000  # most Gaussians of a scene that is shown in 3D, 8 MB of a notebook
     is_light = len(input_scene.gaussians) > max_solid if light is None else light
     data = collect_page_data(
         scene_title(Path(scene)) if isinstance(scene, str | PathLike) else "scene", shown_scene, gaussians,
         [_num_bytes(scene), *(_num_bytes(result) for result in loaded.values())], held_out,
-        cameras=cameras, new_gains=gains, light=is_light, progress=progress or (lambda *_: None),
+        cameras=cameras, new_gains=gains, changes=changes, light=is_light, progress=progress or (lambda *_: None),
     )  # fmt: skip
     return Page(view_page(data).decode(), headline(data))
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from gsmerge.errors import count_words
 from gsmerge.method.fit.outside import outside_cameras
 from gsmerge.method.geometry.transforms import motion_matrices, motion_vectors, nearest_views, normalize
 from gsmerge.method.geometry.views import concat_cameras, take_rows
@@ -61,11 +62,15 @@ def add_views(scene: Scene, *, shown: bool = False, placed: str = NO_VIEWS) -> S
 
     The arguments are those of :func:`place_views`. Raises ValueError if no Gaussian is finite.
     """
-    return place_views(keep_finite(scene), shown=shown, placed=placed)
+    finite = keep_finite(scene)
+    count = len(scene.gaussians) - len(finite.gaussians)
+    if count:
+        note(describe_dropped(count))
+    return place_views(finite, shown=shown, placed=placed)
 
 
 def keep_finite(scene: Scene) -> Scene:
-    """Keep the finite Gaussians, with a note on the others; ValueError if no Gaussian is finite."""
+    """Keep the finite Gaussians of a scene; ValueError if no Gaussian is finite."""
     g = scene.gaussians
     finite = np.ones(len(g), bool)
     for array in vars(g).values():
@@ -77,8 +82,12 @@ def keep_finite(scene: Scene) -> Scene:
         raise ValueError("expected at least one finite Gaussian, got none")
     if not count:
         return scene
-    note(f"{count} Gaussians are not finite and were left out")
     return take_rows(scene, np.flatnonzero(finite))
+
+
+def describe_dropped(count: int) -> str:
+    """Say that :func:`keep_finite` dropped a number of Gaussians."""
+    return f"{count_words(count, 'Gaussian')} not finite: left out"
 
 
 def place_views(scene: Scene, *, shown: bool = False, placed: str = NO_VIEWS) -> Scene:

@@ -57,7 +57,7 @@ def make_part() -> PicturedScene:
 def drawings() -> tuple[PicturedScene, PicturedScene]:
     """Return that part of the room, and the same with drawings from outside."""
     part = make_part()
-    return part, draw_outside(part)
+    return part, draw_outside(part)[0]
 
 
 def test_drawings_from_outside_count_where_they_show_what_no_view_sees(
@@ -86,7 +86,7 @@ def test_drawings_from_outside_do_not_change_own_views(drawings: tuple[PicturedS
     np.testing.assert_array_equal(own.cameras.viewmats, part.cameras.viewmats)
     assert (drawn.importance[len(part) :] == 1).all()
     assert not drawn.empty[len(part) :].any()
-    assert draw_outside(replace(part, masks=None)).masks[: len(part)].all()
+    assert draw_outside(replace(part, masks=None))[0].masks[: len(part)].all()
 
 
 def test_larger_photos_get_larger_drawings(drawings: tuple[PicturedScene, PicturedScene]) -> None:
@@ -105,7 +105,7 @@ def test_nothing_is_drawn_where_views_see_all_or_nothing(room: Scene, far: int) 
     scene = pictured(seen_from(room, range(VIEWS)))
     if far:
         scene = with_pixels(replace(scene, gaussians=unaligned_scenes.far_behind(scene.gaussians, far), pixels=None))
-    assert draw_outside(scene) is scene
+    assert draw_outside(scene)[0] is scene
 
 
 def refuse(_: PicturedScene) -> PicturedScene:
@@ -136,8 +136,8 @@ def test_gaussians_that_no_view_sees_stay_in_a_result(room: Scene, monkeypatch: 
 
     result = compact_part()
     assert len(result.gaussians) == 300
-    assert noted(result.report.notes, "no view sees 5 % of the Gaussians", "from 1 place beside")
-    monkeypatch.setattr("gsmerge.prepare.steps.draw_outside", lambda scene: scene)
+    assert noted(result.report.choices["changes"], "no view sees 5 % of the Gaussians", "from 1 place beside")
+    monkeypatch.setattr("gsmerge.prepare.steps.draw_outside", lambda scene: (scene, ""))
     scores = [scenes.psnr_of(gaussians, away) for gaussians in (result.gaussians, compact_part().gaussians)]
     assert scores[0] > scores[1] + 4  # dB: without drawings a part is missing
     assert scores[0] > scenes.psnr_of(part.gaussians, away) - 3  # dB: a result of 300 Gaussians is coarser

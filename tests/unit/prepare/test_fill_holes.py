@@ -23,7 +23,6 @@ from gsmerge.prepare.fill_holes import LARGE_SIDE, RIM_PIXELS, fill_holes, large
 from gsmerge.prepare.prepare_scene import prepare
 from gsmerge.prepare.true_pixels import with_pixels
 from gsmerge.reading.read_scene import load_scene
-from gsmerge.runtime.record import record_run
 from gsmerge.types import Cameras, Gaussians, PicturedScene, Pixels
 
 WIDTH, HEIGHT, NEAR, FAR, FLOOR = 96, 64, 3.0, 6.0, 24
@@ -121,15 +120,13 @@ def test_filled_holes_between_rows_have_the_depth_beside_them() -> None:
 
 def test_filled_rows_follow_the_rows_of_a_scene_without_pixels() -> None:
     scene = without_pixels(make_walls())
-    with record_run() as record:
-        filled = filled_everywhere(scene)
+    filled = filled_everywhere(scene)
     count = len(scene.gaussians)
     assert all(np.array_equal(values[:count], getattr(scene.gaussians, name))
                for name, values in vars(filled.gaussians).items())  # fmt: skip
     before, after = (render(some.gaussians, some.cameras).alphas for some in (scene, filled))
     assert (before < 0.5).mean() > 0.3
     assert (after > 0.5).mean() > 0.99
-    assert noted(record.notes, f"{len(filled.gaussians) - count:,} pixels that no Gaussian covers enough get")
 
 
 def test_a_part_of_what_photos_show_is_not_filled() -> None:
@@ -170,9 +167,9 @@ def test_dropped_pixels_are_filled_where_cameras_are_known(tmp_path: Path, photo
     loaded = load_scene(folder).scene
     scene = loaded if photos else replace(loaded, images=None)
     assert np.array_equal(np.flatnonzero(scene.pixels.shown.reshape(-1)), da3_rows(tiny))
-    with record_run() as record:
-        prepared = prepare(scene)
-    assert noted(record.notes, "pixels that no Gaussian covers enough")
+    prepared = prepare(scene)
+    added = len(prepared.scene.gaussians) - len(scene.gaussians)
+    assert noted(prepared.changes, f"{added} Gaussians added at pixels that no Gaussian covered")
     alphas = render(prepared.scene.gaussians, prepared.scene.cameras).alphas
     assert (alphas > 0.5).mean() > 0.99
     assert np.array_equal(prepared.input_scene.pixels.shown, scene.pixels.shown)

@@ -48,7 +48,7 @@ def test_a_uniform_background_is_no_surface(ball: Scene, color: tuple[float, flo
     alphas = render(ball.gaussians, ball.cameras).alphas
     scene = replace(ball, images=ball.images + (1 - alphas) * np.float32(color))
     result = compact(scene, **FIT)
-    assert any("one colour where the scene shows nothing" in note for note in result.report.notes)
+    assert any("one colour where the scene shows nothing" in note for note in result.report.choices["changes"])
     beside = alphas[..., 0] < 0.02
     assert render(result.gaussians, ball.cameras).alphas[..., 0][beside].mean() < 0.02
     assert over_both(result.gaussians, ball) > 22

@@ -46,7 +46,7 @@ def changed(scene: Scene, rows: np.ndarray, **columns: Any) -> Scene:
 def pictures_of(scene: Scene) -> tuple[np.ndarray, np.ndarray, list[str]]:
     """Return pictures, masks and notes."""
     with record_run() as record:
-        colored = add_row_colors(scene)
+        colored, _ = add_row_colors(scene)
     assert colored.gaussians is scene.gaussians
     masks = np.ones_like(scene.pixels.shown) if colored.masks is None else colored.masks
     return colored.images, masks, record.notes

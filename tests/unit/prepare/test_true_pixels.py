@@ -14,7 +14,6 @@ from gsmerge.method.geometry.frame import canonicalise
 from gsmerge.method.geometry.transforms import camera_depths
 from gsmerge.method.kernels import elementary
 from gsmerge.prepare.true_pixels import HIDDEN_SIZE, LOW_PASS, choose_level, find_pixels, raise_sizes, with_pixels
-from gsmerge.runtime.record import record_run
 from gsmerge.types import NO_CAMERAS
 
 WIDTH, HEIGHT = 96, 72
@@ -119,9 +118,8 @@ def test_hidden_gaussians_get_the_size_of_the_low_pass(factor: float, every: int
     room = canonicalise(replace(room, gaussians=resized(room.gaussians, factor, every)))[0]
     scene = with_pixels(room if own else unaligned_scenes.shuffled(room))
     seen = scene.pixels.homes >= 0
-    with record_run() as record:
-        raised = raise_sizes(scene)
-    assert len(record.notes) == noted
+    raised, change = raise_sizes(scene)
+    assert ("far smaller than a pixel" in change) == noted
     assert (raised is scene) == (not noted)
     if noted:
         np.testing.assert_allclose(raised.gaussians.scales[seen], least_scales(scene)[seen], rtol=1e-5)
@@ -133,8 +131,8 @@ def test_sizes_of_a_sound_scene_are_not_raised_for_views_of_few_pixels(room: Sce
     Ks = cameras.Ks / np.array([[8], [8], [1]], cameras.Ks.dtype)
     small = replace(cameras, Ks=Ks, width=WIDTH // 8, height=HEIGHT // 8)
     scene = with_pixels(Scene(room.gaussians, small, None, None, room.names))
-    assert raise_sizes(scene) is scene
-    assert raise_sizes(replace(scene, gaussians=resized(scene.gaussians, 0.01))) is not scene
+    assert raise_sizes(scene)[0] is scene
+    assert raise_sizes(replace(scene, gaussians=resized(scene.gaussians, 0.01)))[0] is not scene
 
 
 @pytest.mark.parametrize("factor", [1 / 30, 1e-5])
