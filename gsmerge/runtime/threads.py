@@ -5,18 +5,20 @@ view or on another band of an image. Threads wait for each other only at the end
 while they wait. A result cannot depend on the number of threads, because every item is computed by itself and results
 are returned in order. While a pool is in use, OpenCV and torch may use one thread each, so that they do not compete
 with the pool for cores. Torch is limited only if other code has imported it.
+
+The threads are those of the standard library. Its ``map`` makes a future for each item: in place of
+:func:`parallel_map`, a call with eight items of 0.25 ms takes 1.05 to 1.18 times the CPU.
 """
 
 from __future__ import annotations
 
-import itertools
 import os
 import sys
 import threading
 import warnings
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from queue import SimpleQueue
 from typing import Any, TypeVar
 
 import cv2
@@ -29,29 +31,6 @@ T = TypeVar("T")
 R = TypeVar("R")
 LIBRARIES = r"(PIL|numpy|gsmerge\.io)\b"  # modules that warn of damaged files, which readers report themselves
 AT_ONCE = 12  # most results of in_turn that are in memory at the same time
-
-
-class _Pool:
-    """Threads that wait for work, and start it in a tenth of the time that an executor with futures takes."""
-
-    def __init__(self, count: int) -> None:
-        self.work = SimpleQueue[Callable[[], None] | None]()
-        self.threads = [threading.Thread(target=self._run, name=f"gsmerge_{i}", daemon=True) for i in range(count)]
-        for thread in self.threads:
-            thread.start()
-
-    def _run(self) -> None:
-        work_alone()
-        while (work := self.work.get()) is not None:
-            work()
-            del work  # otherwise the arrays of ``work`` would stay in memory until the next work comes
-
-    def shutdown(self) -> None:
-        """End the threads after all submitted work is done."""
-        for _ in self.threads:
-            self.work.put(None)
-        for thread in self.threads:
-            thread.join()
 
 
 @contextmanager
@@ -88,7 +67,7 @@ class _Quiet:
 class _Local(threading.local):
     """State of each calling thread, so that two calls at the same time do not shut down each other's pool."""
 
-    pool: _Pool | None = None
+    pool: ThreadPoolExecutor | None = None
     count = 1  # threads that parallel_map uses
     inside = False  # True on a thread that computes an item; such a thread must not wait for a pool
     holds_torch = False  # True if torch was limited to one thread because this thread has a pool
@@ -153,7 +132,8 @@ def use_threads(count: int | None = None) -> Iterator[int]:
             _libraries.opencv = cv2.getNumThreads()
         _libraries.pools += 1
         cv2.setNumThreads(1)
-    _local.pool = _Pool(count - 1)
+    num_helpers = max(count - 1, 1)  # a pool has a thread at least, which starts only when it gets work
+    _local.pool = ThreadPoolExecutor(num_helpers, "gsmerge", work_alone)
     _local.count = count
     hold_torch()
     try:
@@ -192,44 +172,37 @@ def parallel_map(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
 
     Outside of :func:`use_threads`, a pool with all processors is made for the call. If ``function`` itself calls
     :func:`parallel_map`, the inner call computes its items one by one. The calling thread computes items as well, and a
-    free thread takes the next item. The call does not wait for threads that took no item. After an error, a thread
-    takes further items without computing them. If several items fail, the error of the first failed item is raised,
-    even if another thread failed earlier.
+    free thread takes the next item. The call does not wait for threads that took no item. Once an item has failed, a
+    thread ends after its item. If several items fail, the error of the first failed item is raised, even if another
+    thread failed earlier: items are taken in order, and each item that is taken is computed.
     """
     items = list(items)
     with use_threads() as count:
         if count == 1 or len(items) < 2 or _local.pool is None or _local.inside:
             return [function(item) for item in items]
         results: list[R] = [None] * len(items)  # type: ignore[list-item]
-        indices = itertools.count()  # its next() is atomic
+        indices = iter(range(len(items)))  # its next() is atomic
         errors: dict[int, BaseException] = {}  # by index of the item
-        counts: SimpleQueue[int] = SimpleQueue()  # number of items that each thread took
 
         def work() -> None:
-            """Take items and compute them until no item is left, and then report how many items were taken."""
-            num_taken, has_failed = 0, False
+            """Take items and compute them until no item is left, or until an item has failed."""
             for index in indices:
-                if index >= len(items):
-                    break
-                num_taken += 1
                 try:
-                    if not has_failed:
-                        results[index] = function(items[index])
+                    results[index] = function(items[index])
                 except BaseException as error:
-                    errors[index], has_failed = error, True
-            if num_taken:
-                counts.put(num_taken)
+                    errors[index] = error
+                if errors:
+                    break
 
-        for _ in range(min(count, len(items)) - 1):
-            _local.pool.work.put(work)
+        helpers = [_local.pool.submit(work) for _ in range(min(count, len(items)) - 1)]
         _local.inside = True
         try:
             work()
         finally:
             _local.inside = False
-        num_left = len(items)
-        while num_left:
-            num_left -= counts.get()
+        for helper in helpers:
+            if not helper.cancel():  # it has begun
+                helper.result()
         if errors:
             raise errors.pop(min(errors))
         return results
