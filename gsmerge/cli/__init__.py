@@ -17,7 +17,8 @@ from typing import NoReturn
 INTERRUPTED = 130  # exit code
 # Parameters of glibc with their values, see mallopt(3). An array of 32 MiB or more gets separate pages, which return to
 # the system when the array is deleted. The process keeps up to 256 MiB of the memory of deleted smaller arrays for new
-# arrays. With glibc's default values, the system clears new pages for each array, a tenth of the time of `view`
+# arrays. With glibc's default values, the system clears new pages for each array: `view` then has 2.3 times the page
+# faults, at the same peak of memory
 M_MMAP_THRESHOLD, M_TRIM_THRESHOLD = (-3, 1 << 25), (-1, 1 << 28)
 
 
@@ -75,7 +76,8 @@ def program() -> NoReturn:
 
     New arrays reuse the memory of deleted arrays, if the C library can. The process then keeps more memory than it
     uses. At the end exit handlers run, and output is flushed. The interpreter is not shut down, because freeing
-    gigabytes of arrays takes time.
+    modules and arrays takes time: with `sys.exit`, 0.1 s more of CPU for `gsmerge --help`, and 0.15 s more for a draft
+    run, which takes 3 s.
     """
     with suppress(AttributeError, OSError, TypeError):  # not glibc
         mallopt = ctypes.CDLL(None).mallopt
