@@ -1,7 +1,8 @@
 """The standard library's dataclasses, of which frozen ones are made in a third of the time.
 
-For each class with ``frozen=True`` the standard library compiles six methods, and a run makes 165 classes, which took
-0.1 seconds of every command. Here all classes share these methods but for ``__init__``.
+For each class with ``frozen=True`` the standard library compiles six methods. Here all classes share these methods but
+for ``__init__``. With the standard library's decorator, ``--help`` (26 classes) takes 1.09 times the instructions, and
+what a run imports (158 classes) 1.29 times, .06 to .09 s.
 """
 
 from __future__ import annotations
