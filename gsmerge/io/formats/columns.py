@@ -94,7 +94,8 @@ def check_columns(path: Path, row_type: np.dtype[np.void], layers: Sequence[str]
     """
     colors = arrays.color_columns(row_type.names)  # columns such as ``red`` may be bytes
     for name in row_type.names or ():
-        dtype, is_used = row_type[name], name in (*arrays.REQUIRED_COLUMNS, *colors) or name.startswith("f_rest_")
+        dtype = row_type[name]
+        is_used = name in (*arrays.REQUIRED_COLUMNS, *colors) or name.startswith("f_rest_")
         is_color_byte = dtype == np.uint8 and name in colors and colors != arrays.SH0
         if is_used and dtype.kind != "f" and not is_color_byte:
             type_name = _WHOLE_TYPES[dtype.kind][dtype.itemsize // 2]
@@ -128,7 +129,9 @@ def describes_places(name: str) -> bool:
 
 def list_names(names: Sequence[str]) -> str:
     """List the names of columns for a message: the first six names, and the number of further names."""
-    max_names, max_characters = 6, 60  # most listed names, and most characters of each
+    # most listed names, and most characters of each
+    max_names = 6
+    max_characters = 60
     num_unlisted = len(names) - max_names
     listed = ", ".join(name[:max_characters] for name in names[:max_names])
     return listed + (f" and {num_unlisted} more" if num_unlisted > 0 else "")

@@ -38,10 +38,12 @@ _HARMONICS = (np.r_[0, (np.arange(1, 255) + 0.5) / 256, 1].astype(np.float32) - 
 
 def packed_rows(path: Path, elements: Mapping[str, Element]) -> arrays.PackedRows:
     """Return the rows of a compressed PLY as rows of an ordinary PLY, with opacities as logits."""
-    vertex, chunk = elements["vertex"], elements["chunk"]
+    vertex = elements["vertex"]
+    chunk = elements["chunk"]
     _check_types(path, vertex, PACKED, ("u4", "i4"))
     _check_types(path, chunk, RANGE_COLUMNS, ("f4", "f8"))
-    count, num_chunks = vertex.count, -(-vertex.count // CHUNK)
+    count = vertex.count
+    num_chunks = -(-vertex.count // CHUNK)
     if count == 0:
         raise SceneError(path, "expected at least one Gaussian, found 0 vertices", "export it again")
     if chunk.count < num_chunks:
@@ -89,7 +91,8 @@ def _check_types(path: Path, element: Element, columns: tuple[str, ...], types: 
     stored = {name: row_type[name].str[1:] for name in row_type.names or ()}  # of an element without lists
     wrong = next((name for name in columns if stored.get(name) not in types), None)
     if wrong is not None:
-        place, found = f"in element '{element.name}' of a compressed file", stored.get(wrong, "none")
+        place = f"in element '{element.name}' of a compressed file"
+        found = stored.get(wrong, "none")
         raise SceneError(path, f"expected {wrong} {place} as {types[0]}, found {found}", "export it again")
 
 

@@ -47,7 +47,8 @@ def describe_extra_columns(columns: np.ndarray, missing: Sequence[str], format_:
 
     ``missing``: columns that some inputs lack. ``moves``: whether the positions of Gaussians are changed.
     """
-    names, notes = list(columns.dtype.names or ()), list[str]()
+    names = list(columns.dtype.names or ())
+    notes = list[str]()
     if missing:
         notes.append(f"columns that some files lack or have in other types are left out: {list_names(missing)}")
     if names and format_ is not PLY:

@@ -48,7 +48,10 @@ COMPRESSED = f"{NAME}_compression_spz_2"  # of which Cesium's tiles consist
 COLOR_SPACE = "srgb_rec709_display"
 READ_EXTENSIONS = {NAME, COMPRESSED, "KHR_mesh_quantization", "KHR_materials_unlit"}
 # Constants of glTF: float32, uint8, a buffer of vertices, and a mesh of points
-_FLOAT, _BYTE, _VERTICES, _POINTS = 5126, 5121, 34962, 0
+_FLOAT = 5126
+_BYTE = 5121
+_VERTICES = 34962
+_POINTS = 0
 _TYPE_NAMES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}  # width of a value -> its type in glTF
 _WIDTHS = {name: width for width, name in _TYPE_NAMES.items()}
 # NumPy's name of a type -> glTF's number of the type. The second dictionary has glTF's number -> NumPy's name
@@ -57,7 +60,9 @@ _DTYPES = {5120: "<i1", _BYTE: "<u1", 5122: "<i2", 5123: "<u2", _FLOAT: "<f4"}
 # A file begins with a mark, the version and the file's length. A chunk begins with its length and its kind
 _FILE_HEAD, _CHUNK_HEAD = struct.Struct("<4sII"), struct.Struct("<I4s")
 HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])  # turns the axes of a ``.ply`` to those of glTF, and back
-_STEPS_PER_NODE, _STEPS_PER_PART = 4, 100  # steps of 20 microseconds in a ReadBudget
+# steps of 20 microseconds in a ReadBudget
+_STEPS_PER_NODE = 4
+_STEPS_PER_PART = 100
 _MOVING_KEYS = {"matrix", "rotation", "scale", "translation"}  # keys of a node that moves its mesh and its children
 
 
@@ -86,12 +91,16 @@ def glb_bytes(gaussians: Gaussians, contents: Contents = PLAIN) -> bytes:
     half_turn = rotator(np.diag([-1.0, -1.0, 1.0]), num_higher)  # from y down to y up
     blocks = [_attributes(half_turn(columns)) for _, columns in column_blocks(gaussians, MAX_DEGREE)]
     # The arrays of all attributes follow each other in one buffer
-    names, content, offset = tuple(blocks[0]), list[bytes](), 0
-    views, accessors = list[dict[str, Any]](), list[dict[str, Any]]()
+    names = tuple(blocks[0])
+    content = list[bytes]()
+    offset = 0
+    views = list[dict[str, Any]]()
+    accessors = list[dict[str, Any]]()
     for view_id, name in enumerate(names):
         parts = [block.pop(name) for block in blocks]
         # An array may be a view of a wider array with padded rows, which is then written
-        array, width = np.concatenate([part if part.base is None else part.base for part in parts]), parts[0].shape[1]
+        array = np.concatenate([part if part.base is None else part.base for part in parts])
+        width = parts[0].shape[1]
         row_bytes = array.strides[0]
         size = len(array) * row_bytes
         stride = {"byteStride": 4} if row_bytes == 4 and width == 1 else {}  # rows of two bytes are padded to four
@@ -169,11 +178,15 @@ def holds_gaussians(path: Path) -> bool:
 
 def read_rows(path: Path) -> StoredRows:
     """Read all Gaussians of a ``.glb``, with the axes of a ``.ply``; raise SceneError for none, or for damage."""
-    budget, parts, sizes = read_budget(path), list[Packed](), dict[str, int]()
+    budget = read_budget(path)
+    parts = list[Packed]()
+    sizes = dict[str, int]()
     with _damage_errors(path), path.open("rb") as file, np.errstate(all="ignore"):  # NaN and inf are set aside later
         document, total = _read_document(file, budget)
         content = _Content(budget, file, document, file.tell(), total)
-        scenes, nodes, visited = document.get("scenes") or [{}], document.get("nodes", []), set[int]()
+        scenes = document.get("scenes") or [{}]
+        nodes = document.get("nodes", [])
+        visited = set[int]()
         budget.check_steps(_STEPS_PER_NODE * len(nodes), "steps for nodes")
         # Each node with the matrix ``[4,4]`` from the frame of its parent to the frame of a ``.ply``
         stack = [(node_id, HALF_TURN) for node_id in scenes[document.get("scene", 0)].get("nodes", [])]
@@ -249,7 +262,8 @@ class _Content:
     def read_view(self, view_id: int) -> bytes:
         """Read a buffer view with the bytes of a ``.spz``; the view must lie in the binary chunk."""
         view = self.document["bufferViews"][view_id]
-        at, length = view.get("byteOffset", 0), view["byteLength"]
+        at = view.get("byteOffset", 0)
+        length = view["byteLength"]
         self.num_read += length
         if min(at, length) < 0 or self.start + at + length > self.end or self.num_read > self.end - self.start:
             raise _ForeignError(f"a truncated one, of {self.end} bytes without {length} of a .spz")
@@ -264,10 +278,14 @@ class _Content:
         view = self.document["bufferViews"][accessor["bufferView"]]
         if view.get("extensions") or view["buffer"] != 0 or "uri" in self.document["buffers"][0]:
             raise _ForeignError(f"one with compressed values or values in another file ({list(view)})")
-        dtype, width = np.dtype(_DTYPES[accessor["componentType"]]), _WIDTHS[accessor["type"]]
-        row_bytes, offset = dtype.itemsize * width, accessor.get("byteOffset", 0)
-        count, stride = check_whole(accessor["count"], "count", 1), view.get("byteStride", row_bytes)
-        num_bytes, position = (count - 1) * stride + row_bytes, self.start + view.get("byteOffset", 0) + offset
+        dtype = np.dtype(_DTYPES[accessor["componentType"]])
+        width = _WIDTHS[accessor["type"]]
+        row_bytes = dtype.itemsize * width
+        offset = accessor.get("byteOffset", 0)
+        count = check_whole(accessor["count"], "count", 1)
+        stride = view.get("byteStride", row_bytes)
+        num_bytes = (count - 1) * stride + row_bytes
+        position = self.start + view.get("byteOffset", 0) + offset
         self.num_read += count * row_bytes
         in_view = offset >= 0 and offset + num_bytes <= view["byteLength"]
         in_chunk = self.start <= position and position + num_bytes <= self.end
@@ -289,10 +307,8 @@ def _read_document(file: IO[bytes], budget: ReadBudget) -> tuple[dict[str, Any],
     start = file.read(_FILE_HEAD.size + _CHUNK_HEAD.size)
     if len(start) < _FILE_HEAD.size + _CHUNK_HEAD.size:
         raise _ForeignError("an early end of file")
-    (magic, version, total), (length, kind) = (
-        _FILE_HEAD.unpack_from(start),
-        _CHUNK_HEAD.unpack_from(start, _FILE_HEAD.size),
-    )
+    magic, version, total = _FILE_HEAD.unpack_from(start)
+    length, kind = _CHUNK_HEAD.unpack_from(start, _FILE_HEAD.size)
     if (magic, version, kind) != (b"glTF", 2, b"JSON"):
         raise _ForeignError("a file that is no binary glTF 2.0")
     if total > budget.file_bytes or length > total - len(start):
@@ -372,7 +388,8 @@ def _transformer(transform: np.ndarray, num_higher: int) -> Callable[[Columns], 
     The matrix must be a similarity: a rotation, a uniform scale and a translation.
     """
     scale = np.sqrt((transform[:3, :3] ** 2).sum(0)).mean()
-    rotation, translation = transform[:3, :3] / scale, transform[:3, 3]
+    rotation = transform[:3, :3] / scale
+    translation = transform[:3, 3]
     deviation = np.abs(matmul(rotation.T, rotation) - np.eye(3)).max()
     is_mirror = (np.cross(rotation[0], rotation[1]) * rotation[2]).sum() < 0
     tolerance = 1e-3  # largest difference of the scales of a node's axes, and largest cosine between two axes

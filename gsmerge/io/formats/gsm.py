@@ -31,8 +31,12 @@ from gsmerge.types import Cameras, Gaussians, Scene, StrPath
 from gsmerge.version import __version__
 
 SCHEMA = 3  # version of the whole file; gsmerge 0.3.0 and earlier wrote lower versions
-HEADER, ENCODED = "gsmerge-state", "gsmerge-encoded"  # names of the metadata entry; gsmerge 0.1 wrote gsmerge-encoded
-SCENE, FEATURES = "scene", "features"  # kinds of files
+# names of the metadata entry; gsmerge 0.1 wrote gsmerge-encoded
+HEADER = "gsmerge-state"
+ENCODED = "gsmerge-encoded"
+# kinds of files
+SCENE = "scene"
+FEATURES = "features"
 REMEDY = "run extend again with all batches"
 # Entry of the header -> its type
 HEADER_ENTRIES: Mapping[str, type] = {
@@ -103,7 +107,9 @@ def read_gsm(path: StrPath, kind: str | None = None) -> GsmFile:
     if kind not in (None, header["kind"]):
         remedy = f"decode them with gsmerge compact {path} --k 2"
         raise SceneError(path, "expected results in the .gsm, found Feature Gaussians", remedy)
-    file, stored, actual = GsmFile(path, header, arrays), header.get("checksums"), _checksums(header, arrays)
+    file = GsmFile(path, header, arrays)
+    stored = header.get("checksums")
+    actual = _checksums(header, arrays)
     if stored != actual:
         wrong = [name for name in actual if not isinstance(stored, dict) or stored.get(name) != actual[name]]
         raise file.error(f"{wrong[0] if wrong else 'arrays'}: expected the checksum in the header, found another")
@@ -177,7 +183,8 @@ def read_rows(path: Path) -> StoredRows:
     num_batches = len(batches) if isinstance(batches, list) else 0
     stored = to_stored([Packed(n, num_higher, unpack)], f"{count_words(num_batches, 'batch')} of views", sizes)
     copied = copied_comments(comments if isinstance(comments, list) else ())
-    pictures, notes = file.header["about"].get("pictures"), tuple[str, ...]()
+    pictures = file.header["about"].get("pictures")
+    notes = tuple[str, ...]()
     others = sorted({str(name)[:40] for name in pictures if name != "photos"}) if isinstance(pictures, list) else []
     if others:
         notes = (f"some batches have no photos; {' and '.join(others)} replace them",)
@@ -189,7 +196,8 @@ def list_batches(path: Path) -> list[dict[str, Any]]:
 
     Entries of a wrong type are left out.
     """
-    batches, described = read_header(path)["about"].get("batches"), list[dict[str, Any]]()
+    batches = read_header(path)["about"].get("batches")
+    described = list[dict[str, Any]]()
     for batch in batches if isinstance(batches, list) else ():
         if isinstance(batch, dict):
             counts = {name: batch.get(name) for name in ("num_views", "num_input", "num_new")}
@@ -233,6 +241,7 @@ def stored_names(file: GsmFile, num_views: int) -> tuple[str, ...]:
 def stored_cameras(file: GsmFile) -> Cameras:
     """Return the cameras of a file; raise SceneError if they are damaged."""
     viewmats = file.finite("viewmats", np.float64, None, 4, 4)
-    width, height = file.header["width"], file.header["height"]
+    width = file.header["width"]
+    height = file.header["height"]
     check_image_size(file.path, width, height)
     return Cameras(viewmats, file.finite("Ks", np.float64, len(viewmats), 3, 3), width, height)

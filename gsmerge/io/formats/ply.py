@@ -98,9 +98,12 @@ def read_rows(path: Path) -> arrays.StoredRows:
     unused = check_columns(path, rows.dtype, layers)
     if not is_compressed:
         _check_places(path, rows)
-    names, comments = tuple(rows.dtype.names or ()), tuple(header.comments)
+    names = tuple(rows.dtype.names or ())
+    comments = tuple(header.comments)
     colors = arrays.color_columns(names)
-    rest, white, notes = {name for name in names if name.startswith("f_rest_")}, 1.0, list[str]()
+    rest = {name for name in names if name.startswith("f_rest_")}
+    white = 1.0
+    notes = list[str]()
     if len(rest) not in (0, 9, 24, 45, 72) or rest != {f"f_rest_{i}" for i in range(len(rest))}:
         numbers = "f_rest_0 to f_rest_8, _23, _44 or _71 (SH degree 1 to 4)"
         problem = f"expected columns {numbers} or none, found {len(rest)} f_rest columns"
@@ -112,7 +115,8 @@ def read_rows(path: Path) -> arrays.StoredRows:
     if arrays.SCALES[2] not in names:
         notes.append(f"2D Gaussians have two scales; the third is set to {THIN:g} of the smaller one")
         comments += (arrays.FLAT_COMMENT,)
-    layout, has_normals = f"SH degree {arrays.sh_degree(len(rest) // 3)}", set(arrays.NORMALS) <= set(names)
+    layout = f"SH degree {arrays.sh_degree(len(rest) // 3)}"
+    has_normals = set(arrays.NORMALS) <= set(names)
     if is_compressed:
         layout = f"compressed, {layout}"
     elif arrays.SH0[0] not in names:
@@ -145,8 +149,10 @@ def _check_places(path: Path, rows: arrays.Rows) -> None:
     Unit quaternions show it: in a shifted file they have norm 1 in the wrong columns, in all rows that are looked at. A
     file whose quaternions are not normalised is not judged.
     """
-    names, sampled = rows.dtype.names or (), rows[:1000]
-    first, types = names.index(arrays.QUATS[0]), {rows.dtype[name] for name in names}
+    names = rows.dtype.names or ()
+    sampled = rows[:1000]
+    first = names.index(arrays.QUATS[0])
+    types = {rows.dtype[name] for name in names}
     are_floats = len(types) == 1 and types.pop().kind == "f"
     if not are_floats or names[first : first + 4] != tuple(arrays.QUATS) or len(sampled) < 3:
         return
@@ -216,13 +222,16 @@ def _vertex_rows(path: Path, elements: Mapping[str, Element]) -> tuple[np.ndarra
     if "vertex" not in elements:
         found = ", ".join(f"'{name}'" for name in elements) or "none"
         raise SceneError(path, f"expected an element 'vertex', found {found}", "name a .ply of Gaussians")
-    rows, prefix = elements["vertex"].rows, ""
-    names, known_name = tuple(rows.dtype.names or ()), arrays.QUATS[0]
+    rows = elements["vertex"].rows
+    prefix = ""
+    names = tuple(rows.dtype.names or ())
+    known_name = arrays.QUATS[0]
     written = next((name.removesuffix(known_name) for name in names if name.endswith(known_name)), "")
     stripped = [re.sub(r"^rotation_(?=[0-3]$)", "rot_", name.removeprefix(written)) for name in names]
     if known_name not in names and len(set(stripped)) == len(names):
         types = [(new_name, rows.dtype[name]) for new_name, name in zip(stripped, names, strict=True)]
-        rows, prefix = rows.view(np.dtype(types)), written
+        rows = rows.view(np.dtype(types))
+        prefix = written
     columns = set(rows.dtype.names or ())
     # 2D Gaussians have no third scale, and files with plain colours have no harmonics of degree 0
     optional = {arrays.SCALES[2], *(() if arrays.color_columns(columns) == arrays.SH0 else arrays.SH0)}
@@ -293,7 +302,8 @@ def open_ply(path: Path) -> tuple[Header, int]:
         is_text = header.format == "ascii"
         if is_text or any(element.has_lists for element in header.elements.values()):
             return header, _read_by_plyfile(path, header, is_text=is_text)
-        place, inode = header.num_bytes, os.fstat(file.fileno()).st_ino
+        place = header.num_bytes
+        inode = os.fstat(file.fileno()).st_ino
         for element in header.elements.values():
             row_type = element.row_type.newbyteorder(_BYTE_ORDERS[header.format])
             element.rows = FileRows(path, row_type, element.count, place, inode)
@@ -397,7 +407,8 @@ def _parse_header(budget: ReadBudget, start: bytes) -> Header:
         is_longer = budget.file_bytes > len(start)
         found = f"no 'end_header' within {MAX_HEADER_BYTES >> 20} MiB" if is_longer else "an early end of file"
         raise SceneError(path, f"expected a PLY header, found {found}", arrays.EXPORT_AGAIN)
-    header, element = Header("", end + len(last_line)), None
+    header = Header("", end + len(last_line))
+    element = None
     text = start[:end].decode("ascii", "replace").replace("\N{REPLACEMENT CHARACTER}", "?")
     for number, line in enumerate(text.split(newline.decode()), 1):
         match line.split():
@@ -425,12 +436,15 @@ def _check_sizes(budget: ReadBudget, header: Header, start: bytes) -> None:
     An element is not read if it has no columns, a negative count, vertices with lists, or too many lists. ``start``:
     the first bytes of the file.
     """
-    path, is_text = Path(budget.path), header.format == "ascii"
+    path = Path(budget.path)
+    is_text = header.format == "ascii"
     steps_per_element = 50  # steps of 20 microseconds for all readers that open the file one after another
     budget.check_steps(steps_per_element * len(header.elements), "steps for elements")
     bytes_left = budget.file_bytes - header.num_bytes
     for element in header.elements.values():
-        name, count, num_columns = element.name, element.count, len(element.columns)
+        name = element.name
+        count = element.count
+        num_columns = len(element.columns)
         if count < 0:
             problem = f"expected a number of rows, found {count} rows of element '{name}'"
             raise SceneError(path, problem, arrays.EXPORT_AGAIN)
@@ -455,7 +469,8 @@ def _check_sizes(budget: ReadBudget, header: Header, start: bytes) -> None:
         # word
         types = [(words[1:2] or words)[0] for words in element.columns.values()]
         row_bytes = sum(2 if is_text else _TYPES.get(word, _TYPES["char"]).itemsize for word in types)
-        bytes_before, bytes_left = bytes_left, bytes_left - count * row_bytes
+        bytes_before = bytes_left
+        bytes_left = bytes_left - count * row_bytes
         if bytes_left < -1:  # the last row of a text may end without a new line
             expected = f"element '{name}' with {count} rows"
             raise truncated(path, expected, bytes_before // row_bytes, "early end of file")

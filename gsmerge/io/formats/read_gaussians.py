@@ -200,7 +200,9 @@ def convert_stored(
 
     Counts and bytes in ``info`` are sums over the files. All other facts in ``info`` are those of the first file.
     """
-    path, stored, dtype = paths[0], parts[0], parts[0].rows.dtype
+    path = paths[0]
+    stored = parts[0]
+    dtype = parts[0].rows.dtype
     names = tuple(dtype.names or ())
     file_bytes = sum(path.stat().st_size + part.bytes_beside for path, part in zip(paths, parts, strict=True))
     out = _make_arrays(dtype, sum(len(part.rows) for part in parts), file_bytes)
@@ -267,9 +269,12 @@ def _make_arrays(dtype: np.dtype[Any], n: int, file_bytes: int) -> dict[str, np.
 
 def _fill_arrays(parts: Sequence[StoredRows], out: dict[str, np.ndarray]) -> tuple[int, int]:
     """Fill arrays with the rows of all files; return the numbers of rows with clipped values and with zero quats."""
-    blocks, first_row = list[tuple[StoredRows, slice, int]](), 0  # each block, after its file, and the file's first row
+    # each block, after its file, and the file's first row
+    blocks = list[tuple[StoredRows, slice, int]]()
+    first_row = 0
     for part in parts:
-        n, block_rows = len(part.rows), max(1, ply.BLOCK_BYTES // part.rows.dtype.itemsize)
+        n = len(part.rows)
+        block_rows = max(1, ply.BLOCK_BYTES // part.rows.dtype.itemsize)
         blocks += [(part, slice(start, min(start + block_rows, n)), first_row) for start in range(0, n, block_rows)]
         first_row += n
 
@@ -278,7 +283,8 @@ def _fill_arrays(parts: Sequence[StoredRows], out: dict[str, np.ndarray]) -> tup
         part, block, first_row = file_block
         rows = part.rows[block] if part.adapt is None else part.adapt(part.rows[block])
         block_out = {name: array[first_row + block.start : first_row + block.stop] for name, array in out.items()}
-        counts, num_done = (0, 0), _convert_with_kernel(rows, block_out)
+        counts = (0, 0)
+        num_done = _convert_with_kernel(rows, block_out)
         if num_done < len(rows):
             counts = _convert_with_numpy(rows[num_done:], {name: array[num_done:] for name, array in block_out.items()})
         if block.start % FREED_ROWS < block.stop - block.start:  # the first block after every FREED_ROWS rows
@@ -320,7 +326,8 @@ def _convert_with_numpy(rows: np.ndarray, out: dict[str, np.ndarray]) -> tuple[i
     Opacities are left as stored.
     A row is valid if its numbers are finite, except that a logit may be infinite and a scale zero.
     """
-    color_names, num_higher = arrays.color_columns(rows.dtype.names), out["shN"].shape[1]
+    color_names = arrays.color_columns(rows.dtype.names)
+    num_higher = out["shN"].shape[1]
     rest_names = [f"f_rest_{channel * num_higher + j}" for j in range(num_higher) for channel in range(3)]
 
     def read(names: Sequence[str]) -> np.ndarray:
@@ -332,7 +339,8 @@ def _convert_with_numpy(rows: np.ndarray, out: dict[str, np.ndarray]) -> tuple[i
 
     with np.errstate(all="ignore"):
         means, colors, rest, quats = (read(names) for names in (arrays.MEANS, color_names, rest_names, arrays.QUATS))
-        log_scales, opacities = read(arrays.SCALES), read(["opacity"])[:, 0]
+        log_scales = read(arrays.SCALES)
+        opacities = read(["opacity"])[:, 0]
         finite = [np.isfinite(values).all(1) for values in (means, colors, rest, quats)]
         out["valid"][:] = np.logical_and.reduce([*finite, ~np.isnan(opacities), (log_scales < np.inf).all(1)])
         limits = ((colors, MAX_HARMONIC), (rest, MAX_HARMONIC), (log_scales, arrays.MAX_LOG_SCALE))
@@ -346,7 +354,8 @@ def _convert_with_numpy(rows: np.ndarray, out: dict[str, np.ndarray]) -> tuple[i
             white = 255 if rows.dtype[name].kind == "u" else 1
             out["sh0"][:, 0, j] = colors[:, j] if name in arrays.SH0 else rgb_to_sh0(colors[:, j] / white)
         out["shN"][:] = rest.reshape(out["shN"].shape)
-        out["scales"][:], out["opacities"][:] = exp(log_scales), opacities
+        out["scales"][:] = exp(log_scales)
+        out["opacities"][:] = opacities
         w, x, y, z = quats.T
         squared_lengths = w * w + x * x + y * y + z * z
         inverse_lengths = 1 / np.sqrt(squared_lengths)
@@ -378,7 +387,10 @@ def _decode_opacities(
     other than logits become invalid. Raise SceneError if the values contradict the caller's choice "raw", or if the
     files have different encodings.
     """
-    path, opacities, encoding, is_guess = paths[0], out["opacities"], str(choice), False
+    path = paths[0]
+    opacities = out["opacities"]
+    encoding = str(choice)
+    is_guess = False
     if choice == "raw":
         finite = np.isfinite(opacities)
         outside = (np.abs(opacities - 0.5) > 0.5 + arrays.UNIT_ROUNDING) & finite
@@ -391,7 +403,10 @@ def _decode_opacities(
         values = opacities if len(empty) == 0 else opacities.copy()
         values[empty] = np.nan  # ignored below
         # A file that declares no encoding, but has at least 100 values, is compared with the others by a guess
-        start, part_names, min_values = 0, dict[str, str](), 100  # encoding -> name of the first part that has it
+        # encoding -> name of the first part that has it
+        start = 0
+        part_names = dict[str, str]()
+        min_values = 100
         for part_path, part in zip(paths, parts, strict=True):
             part_values = values[start : start + len(part.rows)]
             start += len(part_values)
@@ -469,7 +484,8 @@ def find_empty(path: str | Path, out: dict[str, np.ndarray]) -> np.ndarray:
     rows = rows[(out["means"][rows] == 0).all(1)]
     if len(rows) == 0:
         return rows
-    scales, sh0 = out["scales"][rows], out["sh0"][rows, 0]
+    scales = out["scales"][rows]
+    sh0 = out["sh0"][rows, 0]
     empty = (out["quats"][rows] == (1, 0, 0, 0)).all(1) & (scales == scales[:, :1]).all(1) & (sh0 == 0).all(1)
     min_padding = 16  # from this number on, equal rows at the origin are padding; fewer may be Gaussians
     if len(rows) >= min_padding:
@@ -517,9 +533,11 @@ def _describe_incomplete(valid: np.ndarray) -> tuple[str, ...]:
     num_last = len(valid) - 1 - int(valid_rows[-1])  # rows after the last Gaussian
     num_invalid = len(valid) - len(valid_rows)
     if num_last > 1 and num_last > num_invalid - num_last:
-        which, remedy = f"the last {num_last:,}", "export it again, since the export may have been interrupted"
+        which = f"the last {num_last:,}"
+        remedy = "export it again, since the export may have been interrupted"
     elif num_invalid > len(valid_rows):
-        which, remedy = f"{num_invalid:,}", "export the file again unless a mask emptied them"
+        which = f"{num_invalid:,}"
+        remedy = "export the file again unless a mask emptied them"
     else:
         return ()
     return (Doubt(f"{which} of {len(valid):,} rows are no Gaussians; {remedy}"),)

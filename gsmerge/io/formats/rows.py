@@ -32,12 +32,16 @@ LOGIT_COMMENT = "opacity: logit"  # states the encoding in files of gsmerge, so 
 RESULT_COMMENT = "gsmerge result"  # replaces LOGIT_COMMENT in results of commands, and has the same length
 RENDER_COMMENT = "SplatRenderMode"  # written by Brush, with the mode of rendering
 NEW_VIEWS_COMMENT = "gsmerge new views"  # followed by the PSNR (dB) of new views of the input and of the result
-MIP, FLAT = "mip", "2dgs"  # special modes of rendering: antialiased; 2D Gaussians
-MIP_COMMENT, FLAT_COMMENT = f"{RENDER_COMMENT}: {MIP}", f"{RENDER_COMMENT}: {FLAT}"
+# special modes of rendering: antialiased; 2D Gaussians
+MIP = "mip"
+FLAT = "2dgs"
+MIP_COMMENT = f"{RENDER_COMMENT}: {MIP}"
+FLAT_COMMENT = f"{RENDER_COMMENT}: {FLAT}"
 _MODE = re.compile(rf"{RENDER_COMMENT}: (\w+)|antialiased ([01])")  # Brush's and Postshot's comments
 _VERTICAL = re.compile(r"Vertical axis: [+-]?[xyz]", re.IGNORECASE)  # Brush's comment on the file's frame
 
-MEANS, NORMALS = ("x", "y", "z"), ("nx", "ny", "nz")
+MEANS = ("x", "y", "z")
+NORMALS = ("nx", "ny", "nz")
 SH0 = ("f_dc_0", "f_dc_1", "f_dc_2")
 PLAIN_COLORS = (("red", "green", "blue"), ("r", "g", "b"))  # instead of SH0, in files of nerfstudio and of 4DGT
 SCALES = ("scale_0", "scale_1", "scale_2")
@@ -235,7 +239,9 @@ class PackedRows:
 
     def __getitem__(self, block: slice) -> np.ndarray:
         start, stop, _ = block.indices(len(self))
-        num_higher, part_start, columns = _num_rest(self.dtype) // 3, 0, []
+        num_higher = _num_rest(self.dtype) // 3
+        part_start = 0
+        columns = []
         with np.errstate(all="ignore"):  # the reader accepts scales of 0, and sets aside rows that are not finite
             for part in self.parts:
                 part_block = slice(max(start - part_start, 0), min(stop - part_start, part.count))
@@ -449,6 +455,7 @@ def smallest_three(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     Signs are chosen so that the largest component is positive. Files leave the largest component out, since it follows
     from the other three components.
     """
-    largest, rows = np.abs(quats).argmax(1), np.arange(len(quats))
+    largest = np.abs(quats).argmax(1)
+    rows = np.arange(len(quats))
     quats = quats * np.where(quats[rows, largest] < 0, -1.0, 1.0)[:, None]
     return largest, quats[np.arange(4) != largest[:, None]].reshape(-1, 3)

@@ -136,7 +136,8 @@ def read_unzipped(path: Path) -> SogContent:
 
 def read_folder(path: Path) -> arrays.StoredRows:
     """Read the rows of a ``.sog`` without its zip, by its ``meta.json``; raise SceneError as in :func:`read_rows`."""
-    content, meta_bytes = read_unzipped(path), check_file(path)
+    content = read_unzipped(path)
+    meta_bytes = check_file(path)
     rows = arrays.to_stored([content.packed], f"unzipped .sog version {VERSION}", content.sizes, content.mode)
     return replace(rows, bytes_beside=content.num_bytes - meta_bytes)
 
@@ -247,7 +248,8 @@ def _read_packed(files: _Files, meta: dict[str, Any], count: int, budget: ReadBu
 
     def unpack(block: slice) -> arrays.Columns:
         """Return the Gaussians of a block of rows."""
-        largest, smallest = quats[block, 3].astype(int) - FIRST_MODE, (quats[block, :3] / 255 - 0.5) * np.sqrt(2.0)
+        largest = quats[block, 3].astype(int) - FIRST_MODE
+        smallest = (quats[block, :3] / 255 - 0.5) * np.sqrt(2.0)
         codes = np.zeros((len(largest), 0, 3), np.uint8) if labels is None else palette[labels[block]]
         return arrays.Columns(
             means=_decode_means(low_bytes[block] + 256.0 * high_bytes[block], mins, maxs),
@@ -301,7 +303,8 @@ def sog_files(columns: arrays.Columns, mode: str | None = None) -> dict[str, byt
     codes, mins, maxs = _quantise_means(columns.means)
     means_files = {"means_l.webp": _encode_texture(codes & 255), "means_u.webp": _encode_texture(codes >> 8)}
     add("means", means_files, mins=mins, maxs=maxs)
-    scales, sh0 = fit_codebook(columns.log_scales), fit_codebook(columns.sh0)
+    scales = fit_codebook(columns.log_scales)
+    sh0 = fit_codebook(columns.sh0)
     add(
         "scales", {"scales.webp": _encode_texture(nearest_codes(scales, columns.log_scales))}, codebook=_shorten(scales)
     )
@@ -335,7 +338,8 @@ def round_means(means: np.ndarray) -> np.ndarray:
 def _quantise_means(means: np.ndarray) -> tuple[np.ndarray, list[float], list[float]]:
     """Quantise the signed logarithms of means to 16 bits; also return their minima and maxima for ``meta.json``."""
     logs = np.sign(means) * log1p(np.abs(means))
-    mins, maxs = logs.min(axis=0), logs.max(axis=0)
+    mins = logs.min(axis=0)
+    maxs = logs.max(axis=0)
     codes = np.round((logs - mins) / np.where(maxs > mins, maxs - mins, 1) * 65535).astype(int)
     return codes, _shorten(mins), _shorten(maxs)
 
@@ -387,7 +391,8 @@ def fit_codebook(values: np.ndarray) -> np.ndarray:
     ends = np.unique([*equal_width, *equal_count])
     # How many values each cell has, and their mean. Neighbouring cells are merged until 256 cells are left
     count, mean = np.diff(ends).astype(float).tolist(), (np.diff(sums[ends]) / np.diff(ends)).tolist()
-    previous, following = list(range(-1, len(count) - 1)), list(range(1, len(count) + 1))
+    previous = list(range(-1, len(count) - 1))
+    following = list(range(1, len(count) + 1))
 
     def merge_entry(i: int) -> tuple[float, int, int, float, float]:
         """Return the error that merging cell ``i`` and the next cell adds, both cells' indices, and their counts."""
@@ -402,7 +407,8 @@ def fit_codebook(values: np.ndarray) -> np.ndarray:
         while following[i] != j or [count[i], count[j]] != counts:  # one of the two cells has been merged meanwhile
             _, i, j, *counts = heapq.heappop(heap)
         mean[i] = (count[i] * mean[i] + count[j] * mean[j]) / (count[i] + count[j])
-        count[i], count[j] = count[i] + count[j], 0.0
+        count[i] = count[i] + count[j]
+        count[j] = 0.0
         following[i] = following[j]
         if following[i] < len(count):
             previous[following[i]] = i
@@ -413,7 +419,8 @@ def fit_codebook(values: np.ndarray) -> np.ndarray:
     max_steps = 200  # steps of Lloyd's algorithm
     for _ in range(max_steps):
         ends = np.concatenate([[0], np.searchsorted(ordered, (codes[1:] + codes[:-1]) / 2), [len(ordered)]])
-        numbers, totals = np.diff(ends), np.diff(sums[ends])
+        numbers = np.diff(ends)
+        totals = np.diff(sums[ends])
         cell_means = np.where(numbers > 0, totals / np.maximum(numbers, 1), codes)
         if np.array_equal(cell_means, codes):
             break

@@ -12,7 +12,8 @@ from pathlib import Path
 from gsmerge.errors import GsmergeError, SceneError, UsageError
 from gsmerge.io.first_bytes import CONVERTER_PACKAGE
 
-SPLAT_TRANSFORM_PROGRAM, VARIABLE = "splat-transform", "GSMERGE_SPLAT_TRANSFORM"
+SPLAT_TRANSFORM_PROGRAM = "splat-transform"
+VARIABLE = "GSMERGE_SPLAT_TRANSFORM"
 TIME_LIMIT = 1800  # seconds after which the program is stopped
 
 

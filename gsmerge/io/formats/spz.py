@@ -35,7 +35,8 @@ from gsmerge.types import SH_C0, Gaussians, StrPath
 
 # Default version and largest degree of harmonics of written files. Spark 2.2 does not read version 4 of the format, and
 # old readers read only version 2
-VERSION, MAX_DEGREE = 3, 3
+VERSION = 3
+MAX_DEGREE = 3
 MAGIC = 0x5053474E  # "NGSP", the first bytes of the header
 HEADER = struct.Struct("<IIIBBBB")  # magic, version, count, SH degree, fraction bits, flags, number of streams or zero
 TABLE_START = struct.Struct("<I12x")  # where the table of version 4 begins, in bytes from the file's start
@@ -53,7 +54,9 @@ _REVERSED = {"LFD", "RFD", "LBU", "RBU"}  # axes whose y and z Niantic's library
 _OPPOSITE = dict(zip("LRDUBF", "RLUDFB", strict=True))
 _MAX_EXTENSIONS = 1 << 20  # most bytes of all extension records
 GZIP_MAGIC, ZSTANDARD_MAGIC = b"\x1f\x8b", MAGIC.to_bytes(4, "little")  # first bytes of versions 1 to 3, and of 4
-SYSTEM, UNIX = 9, b"\3"  # position of the operating system in a gzip header, and the value that is always written
+# position of the operating system in a gzip header, and the value that is always written
+SYSTEM = 9
+UNIX = b"\3"
 SCENE_BITS = 14  # bits of a position within the scene: steps of a sixteenth of a pixel if the scene fills 1,000 pixels
 LARGEST_POSITION = 2**23 - 1
 _SHIFTS = (20, 10, 0)  # lowest bits of the three smaller components of a rotation in its word
@@ -202,7 +205,8 @@ def _zstandard_parts(
     """
     import zstandard  # few files need it
 
-    path, header = budget.path, _read_header(budget, packed, packed[: HEADER.size], (4,), before)
+    path = budget.path
+    header = _read_header(budget, packed, packed[: HEADER.size], (4,), before)
     sizes = [header.count * width for width in header.widths if width]
     try:
         (table_start,) = TABLE_START.unpack_from(packed, HEADER.size)
@@ -243,7 +247,8 @@ def _zstandard_parts(
 
 def _unpack(parts: list[np.ndarray], header: Header) -> arrays.Columns:
     """Convert a block of rows, given as a part of each stored column, to Gaussians."""
-    version, fraction = header.version, header.fraction
+    version = header.version
+    fraction = header.fraction
     means, opacities, colors, scales, rotations, harmonics = parts
     # The three little-endian bytes of a signed number become the upper bytes of an int32, which is shifted and keeps
     # the sign
@@ -308,7 +313,9 @@ def spz_columns(
 
     ``version``: 2 or 3. Raise ValueError if there is NaN or inf.
     """
-    means, count, degree = as_array(gaussians.means), len(gaussians), min(max_degree, gaussians.sh_degree)
+    means = as_array(gaussians.means)
+    count = len(gaussians)
+    degree = min(max_degree, gaussians.sh_degree)
     # The fraction is chosen only if all means are finite, since other means raise an error later
     fraction = choose_fraction(means if np.isfinite(means).all() else means[:0], SCENE_BITS)
     header = Header(version, count, degree, fraction, MIP_FLAG * mip, 0)
@@ -357,7 +364,8 @@ def spz_bytes(gaussians: Gaussians, contents: Contents = PLAIN) -> bytes:
 
     The file has no extensions, since three 0.187 and mkkellogg's viewer refuse bytes after the columns.
     """
-    mip, version = arrays.render_mode(contents.comments) == arrays.MIP, contents.options.spz_version
+    mip = arrays.render_mode(contents.comments) == arrays.MIP
+    version = contents.options.spz_version
     header, parts = spz_columns(gaussians, MAX_DEGREE, mip=mip, version=version)
     columns = deque(parts)
     del parts  # so that each column is freed as soon as it is compressed
@@ -368,7 +376,9 @@ def gzip_bytes(
     parts: Iterable[bytes | memoryview], *, level: int = 6, strategy: int = zlib.Z_DEFAULT_STRATEGY
 ) -> bytes:
     """Compress parts to a gzip stream, without the time and the system, so that equal parts give equal bytes."""
-    packer, packed = zlib.compressobj(level, wbits=31, strategy=strategy), bytearray()  # zlib writes no time
+    # zlib writes no time
+    packer = zlib.compressobj(level, wbits=31, strategy=strategy)
+    packed = bytearray()
     for part in parts:
         packed += packer.compress(part)
     packed += packer.flush()

@@ -93,7 +93,8 @@ def write_output(add: AddOutput, path: Path, index: Path, contents: Contents) ->
             # chunks of two results
             document = read_json(program_index)
             for number, name in enumerate(document["filenames"]):
-                chunk_folder, digest = (program_index.parent / name).parent, hashlib.sha256()
+                chunk_folder = (program_index.parent / name).parent
+                digest = hashlib.sha256()
                 for file in sorted(chunk_folder.iterdir()):
                     digest.update(file.read_bytes())
                 renamed = chunk_folder.rename(f"{chunk_folder}-{digest.hexdigest()[:8]}")
@@ -213,9 +214,12 @@ def read_rows(path: Path, level: int = 0, index: StreamedIndex | None = None) ->
     if not chunks:
         raise SceneError(path, f"expected Gaussians at level {level}, found none", "export it again")
     # Together, the chunks may take as much memory as is allowed for one file of as many bytes
-    root, real_paths = os.path.realpath(path.parent), set[Path]()
+    root = os.path.realpath(path.parent)
+    real_paths = set[Path]()
     contents: list[sog.SogContent] = []
-    num_bytes, total, num_higher = check_file(path), 0, 0
+    num_bytes = check_file(path)
+    total = 0
+    num_higher = 0
     for chunk, count in chunks.items():
         real_path = Path(os.path.realpath(chunk))
         if not real_path.is_relative_to(root) or real_path in real_paths:
@@ -227,7 +231,8 @@ def read_rows(path: Path, level: int = 0, index: StreamedIndex | None = None) ->
         if count not in (None, packed.count):
             problem = f"expected {count:,} Gaussians, as {INDEX} says, found {packed.count:,}"
             raise SceneError(chunk, problem, "export it again")
-        num_bytes, total = num_bytes + contents[-1].num_bytes, total + packed.count
+        num_bytes = num_bytes + contents[-1].num_bytes
+        total = total + packed.count
         num_higher = max(num_higher, packed.num_higher)
         arrays.check_gaussian_count(ReadBudget(path, num_bytes), total, num_higher, sog.PACKED_BYTES)
     sizes: dict[str, int] = {}

@@ -195,7 +195,8 @@ def count_for_bytes(format_: Format, max_bytes: int, sh_degree: int) -> int:
     """
     if format_.count is not None:
         return format_.count(max_bytes, sh_degree)
-    gaussian_bytes, fixed_bytes = format_.gaussian_bytes[: sh_degree + 1][-1], format_.other_bytes()
+    gaussian_bytes = format_.gaussian_bytes[: sh_degree + 1][-1]
+    fixed_bytes = format_.other_bytes()
     if max_bytes < fixed_bytes + gaussian_bytes:
         viewer = f"{fixed_bytes / 1e6:.2f} MB for the viewer of a page and " if fixed_bytes else ""
         problem = f"expected at least {viewer}{gaussian_bytes:.0f} bytes for one Gaussian"
@@ -214,7 +215,8 @@ def estimate_counts(paths: Sequence[Path]) -> tuple[int, int]:
         format_ = find_format(path)
         if format_.read is ply.read_rows:
             file_count, file_rest = ply.header_counts(path, check_size=True)
-            count, num_rest = count + file_count, max(num_rest, file_rest)
+            count = count + file_count
+            num_rest = max(num_rest, file_rest)
         else:  # as if of degree 0
             with suppress(OSError):
                 count += int(path.stat().st_size / (format_.gaussian_bytes or (math.inf,))[0])

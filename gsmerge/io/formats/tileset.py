@@ -96,7 +96,8 @@ def most_bytes(gaussians: Gaussians, cameras: Cameras, comments: Sequence[str]) 
 
 def _tile_bytes(contents: Contents, low: np.ndarray, high: np.ndarray) -> bytes:
     """Encode the ``.glb`` of a tile, whose Gaussians lie mostly between the corners ``low [3]`` and ``high [3]``."""
-    gaussians, packed = contents.levels[0], spz_bytes(contents.levels[0], contents)
+    gaussians = contents.levels[0]
+    packed = spz_bytes(contents.levels[0], contents)
     num_harmonics = (min(MAX_DEGREE, gaussians.sh_degree) + 1) ** 2
     names = ["POSITION", "COLOR_0", f"{NAME}:ROTATION", f"{NAME}:SCALE", *HARMONICS[1:num_harmonics]]
     accessors: list[dict[str, Any]] = [{"componentType": 5126, "type": "VEC3", "count": len(gaussians)} for _ in names]
@@ -124,10 +125,14 @@ def globe_matrix(place: str) -> np.ndarray:
     """
     longitude, latitude, height = parse_place(place)
     angles = np.radians([longitude, latitude])
-    (sin_lon, sin_lat), (cos_lon, cos_lat) = sin(angles), cos(angles)
+    sin_lon, sin_lat = sin(angles)
+    cos_lon, cos_lat = cos(angles)
     up = np.array([cos_lat * cos_lon, cos_lat * sin_lon, sin_lat])
-    east, north = np.array([-sin_lon, cos_lon, 0]), np.array([-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat])
-    semi_major_axis, squared_eccentricity = 6378137.0, 0.0066943799901413165  # metres; of the ellipsoid WGS 84
+    east = np.array([-sin_lon, cos_lon, 0])
+    north = np.array([-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat])
+    # metres; of the ellipsoid WGS 84
+    semi_major_axis = 6378137.0
+    squared_eccentricity = 0.0066943799901413165
     radius = semi_major_axis / np.sqrt(1 - squared_eccentricity * sin_lat**2)  # of curvature in the prime vertical
     matrix = np.eye(4)
     matrix[:3] = np.stack([east, north, up, radius * up + height * up], 1)

@@ -67,25 +67,31 @@ def _judge_scales(out: dict[str, np.ndarray]) -> tuple[bool, str]:
     if len(rows) < _MIN_JUDGED:
         return False, ""
     sample = np.asarray(rows[:: max(1, len(rows) // _SAMPLES)])
-    points, sizes = gather(out["means"], sample).astype(np.float64), gather(out["scales"], sample)
+    points = gather(out["means"], sample).astype(np.float64)
+    sizes = gather(out["scales"], sample)
     low, high = quantiles(points, (0.05, 0.95))
-    width, median_size = float((high - low).max()), median(sizes.max(1))
+    width = float((high - low).max())
+    median_size = median(sizes.max(1))
     too_large = (
         f"half of the Gaussians have a standard deviation above {median_size:.3g} in a scene of width {width:.3g}"
     )
-    spacing, stored = width / float(np.sqrt(len(rows))), log(sizes)
+    spacing = width / float(np.sqrt(len(rows)))
+    stored = log(sizes)
     max_width = 0.25  # scales are wrong if half of the standard deviations exceed this share of the scene's width
-    median_stored, is_vast = float(log(median_size)), median_size > max_width * width
+    median_stored = float(log(median_size))
+    is_vast = median_size > max_width * width
     # Bounds on the median standard deviation, in units of ``spacing``, which is the width of the scene divided by the
     # square root of the number of Gaussians. This median is 0.3 to 2 units in undamaged files, and 10 to 1,000 units if
     # linear scales are read as logarithms
-    min_spacings, max_spacings = 0.01, 6.0
+    min_spacings = 0.01
+    max_spacings = 6.0
     fits_as_stored = min_spacings * spacing <= median_stored <= max_spacings * spacing < median_size
     if fits_as_stored and not arrays.are_logarithms(stored):
         # Large sizes are at least 1.5 times the small sizes, so the logarithms of sizes differ by more than 0.4. Stored
         # sizes are small numbers, and differ by much less. Read as logarithms, they would stand for sizes that are all
         # close to 1
-        min_variation, min_ratio = 0.4, 4.0
+        min_variation = 0.4
+        min_ratio = 4.0
         small, large = (float(value) for value in quantiles(stored.max(1).astype(np.float64), (0.1, 0.9)))
         if is_vast or (small > 0 and float(log(large / small)) > max(min_variation, min_ratio * (large - small))):
             signs = f"they are hardly ever negative (median {median_stored:.3g})"
@@ -149,7 +155,8 @@ def choose_colors(
         return None, "", None
     rows = np.flatnonzero(out["valid"])
     rows = rows[:: max(1, len(rows) // _SAMPLES)]
-    stored, part_rows = out["sh0"][rows, 0], rows[rows < len(part.rows)]
+    stored = out["sh0"][rows, 0]
+    part_rows = rows[rows < len(part.rows)]
     if choice == "rgb":
         return next((units for units in _UNITS if arrays.lie_in_unit_range(units.rgb(stored))), _UNITS[0]), "", None
     plain = None  # colours of the columns red, green and blue, if the file has these, too
@@ -158,7 +165,8 @@ def choose_colors(
         plain = np.stack([columns[name] for name in arrays.PLAIN_COLORS[0]], 1) / np.float32(255)
     # RGB colours of a scene cover more than this part of the range from black to white. Harmonics lie in the range only
     # in scenes with little contrast, and cover a smaller part
-    min_spread, few = 0.5, arrays.MAX_STRAY
+    min_spread = 0.5
+    few = arrays.MAX_STRAY
     for units in _UNITS if len(part_rows) >= _MIN_JUDGED else ():
         rgb = units.rgb(stored[: len(part_rows)])
         if plain is not None and (np.abs(rgb - plain) <= _SAME_COLOR).mean() > 1 - few:

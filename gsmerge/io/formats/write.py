@@ -31,7 +31,8 @@ def limit_notes(path: StrPath, sh_degree: int, count: int) -> list[str]:
 
     Raise UsageError if no format has the ending of the path.
     """
-    format_, notes = output_format(path), list[str]()
+    format_ = output_format(path)
+    notes = list[str]()
     if sh_degree > format_.max_degree:
         notes.append(format_.harmonics_note.format(ending=format_.ending, degree=format_.max_degree))
     if count > format_.max_gaussians:
@@ -52,7 +53,8 @@ def write_apart(add: AddOutput, path: Path, temporary: Path, contents: Contents)
     ``add`` makes the temporary file of a path; ``temporary`` is that of ``path``. Return the path of each level, with a
     list of its only temporary file.
     """
-    written, format_ = {path: [temporary]}, output_format(path, alone=True)
+    written = {path: [temporary]}
+    format_ = output_format(path, alone=True)
     for level in range(1, len(contents.levels)):
         written[level_output(path, level)] = [add(level_output(path, level))]
     for (file,), gaussians in zip(written.values(), contents.levels, strict=True):
@@ -60,7 +62,8 @@ def write_apart(add: AddOutput, path: Path, temporary: Path, contents: Contents)
             check_readable(gaussians, contents.comments)
             file.write_bytes(format_.encode(gaussians, contents))
             continue
-        degree, normals = min(gaussians.sh_degree, format_.max_degree), contents.options.normals
+        degree = min(gaussians.sh_degree, format_.max_degree)
+        normals = contents.options.normals
         # Additional columns belong to the rows of one level
         _write_ply(file, gaussians, True, degree, contents.comments, normals, contents.extra_columns)
     return written
@@ -186,12 +189,14 @@ def rounding_notes(path: StrPath, gaussians: Gaussians) -> list[str]:
     """Note how far a format's rounding of positions moves Gaussians; no notes if renders do not change visibly."""
     if len(gaussians) == 0:
         return []
-    format_, columns = output_format(path), gaussians.numpy()
+    format_ = output_format(path)
+    columns = gaussians.numpy()
     # The sample includes the Gaussians at the least and largest positions, by which formats choose the steps of
     # rounding
     extremes = columns.means.argmin(axis=0), columns.means.argmax(axis=0)
     rows = distinct(np.concatenate([np.arange(0, len(gaussians), len(gaussians) // ROUNDING_GAUSSIANS + 1), *extremes]))
-    means, scales = columns.means.take(rows, axis=0).astype(np.float64), columns.scales.take(rows, axis=0)
+    means = columns.means.take(rows, axis=0).astype(np.float64)
+    scales = columns.scales.take(rows, axis=0)
     sizes = np.sort(scales, axis=1)[:, 1]  # a Gaussian is as large as its second largest scale
     with np.errstate(over="ignore"):
         moves = np.abs(format_.round_means(means) - means).max(axis=1)
