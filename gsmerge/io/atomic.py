@@ -168,7 +168,8 @@ class _Outputs:
                     os.chown(temporary, -1, status.st_gid)
                     os.chown(temporary, status.st_uid, -1)
                 # Without this group, the file's own group gets only the rights that the replaced file gives to everyone
-                mode, has_group = status.st_mode & 0o777, os.stat(temporary).st_gid == status.st_gid
+                mode = status.st_mode & 0o777
+                has_group = os.stat(temporary).st_gid == status.st_gid
                 with suppress(OSError):  # a file system without modes
                     os.chmod(temporary, mode if has_group else mode & (0o707 | (mode & 0o007) << 3))
         for folder in {folder.parent for folder in self.new_folders}:

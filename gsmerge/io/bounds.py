@@ -29,8 +29,12 @@ MAX_FILES = 100_000  # most files and folders below a folder of photos
 MAX_PIXELS = 1 << 26  # most pixels of an image
 
 _ADDRESS = re.compile(r"(https?|s3|gs|ftp|file):/")  # start of a URL
-_FREE_MEMORY, _MEMORY_PER_BYTE = 64_000_000, 20  # bytes of memory for any file, and for each byte of it
-_FREE_STEPS, _BYTES_PER_STEP = 250_000, 10  # steps of 20 microseconds: 5 s for any file, and 2 s for each MB
+# bytes of memory for any file, and for each byte of it
+_FREE_MEMORY = 64_000_000
+_MEMORY_PER_BYTE = 20
+# steps of 20 microseconds: 5 s for any file, and 2 s for each MB
+_FREE_STEPS = 250_000
+_BYTES_PER_STEP = 10
 # Character in a JSON text -> most bytes of the objects that CPython 3.10 to 3.14 makes for it
 _JSON_BYTES = {"[": 88, "{": 130, ":": 110, '"': 30, ",": 34}
 

@@ -126,7 +126,8 @@ def may_be_replaced(path: Path) -> bool:
 
 def refuse_picture(path: Path) -> None:
     """Raise SceneError if a file's ending or first bytes show a picture of a format that is not read."""
-    ending, start = path.suffix.lower(), read_start(path, _START)
+    ending = path.suffix.lower()
+    start = read_start(path, _START)
     for name, endings, pattern in OTHER_PICTURES:
         if ending in endings or re.match(pattern.encode("latin-1"), start):
             problem = f"expected an image, found a picture of the format {name}, which is not read"

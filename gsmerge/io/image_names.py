@@ -132,7 +132,8 @@ def match_masks(
     by_ending = _files_by_ending(folder, files)
     masks = list[Path | None]()
     for name in names:
-        mask, photo = _find_only(folder, by_ending, name, option), Path(name)
+        mask = _find_only(folder, by_ending, name, option)
+        photo = Path(name)
         # If a mask's sub-folder has the name of a folder beside the photo's folder, the mask is that of another photo
         if mask is not None and mask.parent != folder:
             neighbour = photo.parent.parent / mask.parent.name

@@ -34,19 +34,26 @@ _OPAQUE_SUFFIXES = frozenset({".jpg", ".jpeg", ".jfif", ".ppm"})
 # to a multiple of 14 changes the side by up to 7 pixels, which are 2 %
 ASPECT_TOLERANCE = 0.02
 # First and last bytes of a PNG file
-PNG, PNG_END = b"\x89PNG\r\n\x1a\n", b"\0\0\0\0IEND\xaeB`\x82"
-_JPEG, _SCAN = b"\xff\xd8", b"\xff\xda"  # start of a file, and of each of its scans
+PNG = b"\x89PNG\r\n\x1a\n"
+PNG_END = b"\0\0\0\0IEND\xaeB`\x82"
+# start of a file, and of each of its scans
+_JPEG = b"\xff\xd8"
+_SCAN = b"\xff\xda"
 _PHOTO_MEMORY_PER_BYTE = 100  # bytes of memory per byte of a photo or mask that is decoded alone
 _COPIES = 2, 3  # copies of all pixels in memory: while OpenCV decodes, and at most while Pillow decodes and converts
 _PILLOW_BYTES = {"1": 1, "L": 1, "P": 1, "I;16": 2}  # bytes of a pixel by Pillow's mode; 4 in all other modes
 # Bytes of memory for each pixel that a decoder needs besides the decoded pixel
-_COEFFICIENT_BYTES, _WEBP_BYTES, _MOVING_WEBP_BYTES, _PILLOW_WEBP_BYTES = 2, 4, 9, 10
+_COEFFICIENT_BYTES = 2
+_WEBP_BYTES = 4
+_MOVING_WEBP_BYTES = 9
+_PILLOW_WEBP_BYTES = 10
 # First bytes of an image file -> the plugin of Pillow that opens the file
 _PLUGINS = {PNG: "Png", _JPEG: "Jpeg", b"RIFF": "WebP", b"BM": "Bmp"}
 _CHANNELS = 3  # bytes of a decoded photo's pixel
 # Limit of the bytes of a scene's decoded photos: a constant, plus a number of bytes for each byte of the photos' files.
 # A decoded pixel has 3 bytes, and even strongly compressed files have more than 3 / 100 bytes per pixel
-_FREE_PHOTOS, _PHOTOS_PER_BYTE = 512_000_000, 100
+_FREE_PHOTOS = 512_000_000
+_PHOTOS_PER_BYTE = 100
 _SMALLER = "reduce its size: a mask to that of its photo, a photo to about that of its view"
 _BAND = 256  # rows of a mask that are converted at once
 _REDUCTIONS = {  # number by which each side is divided -> OpenCV's flag
@@ -57,7 +64,9 @@ _PNG_CHUNKS = frozenset({b"IHDR", b"PLTE", b"tRNS", b"IDAT"})  # chunks that det
 Size = tuple[int, int]  # width and height in pixels
 Part = tuple[float, float, float, float]  # left, top, right and bottom of a part of a photo, as shares of its sides
 WHOLE: Part = (0.0, 0.0, 1.0, 1.0)  # all of a photo
-_DRAWN, _PNG_START = b"Software\0gsmerge render", 33  # mark of a drawing, and bytes of a PNG before its second chunk
+# mark of a drawing, and bytes of a PNG before its second chunk
+_DRAWN = b"Software\0gsmerge render"
+_PNG_START = 33
 _AT_ONCE = 128 << 20  # most bytes of decoded photos in memory; if they need more, photos are decoded at each use
 
 
@@ -128,8 +137,10 @@ def decode_photos(
     """
     files = list(dict.fromkeys(path for path in paths if path is not None))
     sizes = {path: image_size(path) for path in files}
-    count, file_bytes = sum(path is not None for path in paths), sum(map(check_file, files))
-    num_bytes, max_bytes = _CHANNELS * count * size[0] * size[1], _FREE_PHOTOS + _PHOTOS_PER_BYTE * file_bytes
+    count = sum(path is not None for path in paths)
+    file_bytes = sum(map(check_file, files))
+    num_bytes = _CHANNELS * count * size[0] * size[1]
+    max_bytes = _FREE_PHOTOS + _PHOTOS_PER_BYTE * file_bytes
     if num_bytes > max_bytes:
         problem = f"expected photos of at most {max_bytes / 1e6:,.0f} MB together from files of {file_bytes:,} bytes"
         found = f"found {count:,} of {size[0]} x {size[1]}, {num_bytes / 1e6:,.0f} MB"
@@ -269,7 +280,8 @@ def part_size(size: Size, part: Part) -> Size:
 def cut_part(photo: np.ndarray, part: Part) -> np.ndarray:
     """Cut a part out of a photo ``[h,w,...]``. The returned array shares the photo's memory."""
     width, height = part_size(photo.shape[1::-1], part)
-    left, top = round(photo.shape[1] * part[0]), round(photo.shape[0] * part[1])
+    left = round(photo.shape[1] * part[0])
+    top = round(photo.shape[0] * part[1])
     return photo[top : top + height, left : left + width]
 
 
@@ -407,7 +419,8 @@ def image_size(path: Path, *, limits_memory: bool = True) -> Size:
     more bytes than its pixels need. With ``limits_memory``, also raise SceneError if the pixels take more memory than
     the file allows.
     """
-    num_bytes, work_bytes = check_file(path), 0.0
+    num_bytes = check_file(path)
+    work_bytes = 0.0
     with read_errors(path), path.open("rb") as file:
         start = file.read(24)
         file.seek(0)
@@ -427,7 +440,9 @@ def image_size(path: Path, *, limits_memory: bool = True) -> Size:
         except Exception as error:  # a damaged header may make the library raise any error
             raise _undecodable(path) from error
     check_image_size(path, width, height)
-    max_pixel_bytes, max_extra = 16, 16 << 20  # most bytes of a pixel, four floats, and of profiles and thumbnails
+    # most bytes of a pixel, four floats, and of profiles and thumbnails
+    max_pixel_bytes = 16
+    max_extra = 16 << 20
     if num_bytes > max_pixel_bytes * width * height + max_extra:
         limit = f"{max_pixel_bytes} bytes per pixel and {max_extra >> 20} MiB"
         found = f"{num_bytes >> 20} MiB for {width} x {height} pixels"
@@ -468,7 +483,9 @@ def _png_pixels(data: np.ndarray) -> np.ndarray | None:
     The other chunks are left out, since texts may have many MB, and decoders print messages about damaged colour
     profiles.
     """
-    view, start, pixels = np.ascontiguousarray(data).data, len(PNG), bytearray(PNG)
+    view = np.ascontiguousarray(data).data
+    start = len(PNG)
+    pixels = bytearray(PNG)
     while start + 12 <= len(view):
         length, kind = struct.unpack_from(">I4s", view, start)
         end = start + 12 + length

@@ -33,7 +33,9 @@ def read_tensors(
             if not 0 < length <= budget.file_bytes:
                 raise ValueError("no header of a safetensors file")
             header_bytes = file.read(length)
-            description_bytes, copies = 1800, 3  # memory for the description of an array; copies of the file in memory
+            # memory for the description of an array; copies of the file in memory
+            description_bytes = 1800
+            copies = 3
             budget.check_memory(description_bytes * header_bytes.count(b"{") + copies * budget.file_bytes, "arrays")
             header = parse_json(header_bytes.decode("utf-8"), budget)
             metadata = (header.get("__metadata__") if isinstance(header, dict) else None) or {}

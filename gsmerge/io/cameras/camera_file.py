@@ -21,7 +21,9 @@ from gsmerge.types import Cameras, StrPath
 
 # Largest number in poses and intrinsics, largest side of an image, and smallest focal length, in pixels. Cameras beyond
 # these three limits are not real, and their numbers would overflow in later steps
-MAX_NUMBER, _MAX_SIDE, _MIN_FOCAL = 1e12, 1e6, 1e-6
+MAX_NUMBER = 1e12
+_MAX_SIDE = 1e6
+_MIN_FOCAL = 1e-6
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # turns OpenGL's camera axes (y up, z backward) to OpenCV's (y down, z forward)
 
 # A principal point is in the middle if twice its coordinates differ by at most these pixels from the image's size
@@ -149,7 +151,8 @@ def make_camera_file(
     if lacks_intrinsics:  # the checks need some intrinsics
         focals = [float(max(view.size)) or 1.0 for view in views]
         views = [view._replace(K=make_pinhole(f, f, 0, 0)) for view, f in zip(views, focals, strict=True)]
-    poses, Ks = np.tile(np.eye(4), (len(views), 1, 1)), np.array([view.K for view in views], np.float64)
+    poses = np.tile(np.eye(4), (len(views), 1, 1))
+    Ks = np.array([view.K for view in views], np.float64)
     max_coefficient = 1e6  # smaller coefficients are checked by their effect, when photos are undistorted
     for i, view in enumerate(views):
         pose = np.asarray(view.pose, np.float64)
@@ -235,7 +238,8 @@ def check_size(path: StrPath, name: str, K: np.ndarray, size: tuple[int, int]) -
     if min(size) <= 1:  # the size is not known
         return
     # Largest focal length and principal point, as multiples of the longer side of the image
-    max_focal_sides, max_centre_sides = 1e5, 1e3
+    max_focal_sides = 1e5
+    max_centre_sides = 1e3
     for quantity, pixels, max_sides in (
         ("a focal length", max(K[0, 0], K[1, 1]), max_focal_sides),
         ("a principal point", np.abs(K[:2, 2]).max(), max_centre_sides),
@@ -402,7 +406,8 @@ def list_moves(names: Sequence[str], start: np.ndarray, end: np.ndarray, depth: 
 
 def describe_moves(moves: Sequence[dict[str, Any]]) -> str:
     """Describe in words the mean and the largest rotation and shift of ``moves`` from :func:`list_moves`."""
-    angles, shifts = [move["degrees"] for move in moves], [move["shift"] for move in moves]
+    angles = [move["degrees"] for move in moves]
+    shifts = [move["shift"] for move in moves]
     mean = f"{np.mean(angles):.2g} degrees and {100 * np.mean(shifts):.3g} % of the depth"
     largest = f"{max(angles):.2g} degrees and {100 * max(shifts):.3g} % of the depth"
     return f"{mean} on average, {largest} at most"

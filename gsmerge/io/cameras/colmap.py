@@ -46,7 +46,8 @@ def read_colmap(source: CameraSource, suffix: str) -> StoredCameras:
     Raise SceneError if the model is damaged, has a camera model that is not read, or lacks the camera of an image.
     """
     folder = source.path
-    camera_path, image_path = folder / f"cameras{suffix}", folder / f"images{suffix}"
+    camera_path = folder / f"cameras{suffix}"
+    image_path = folder / f"images{suffix}"
     try:
         cameras, images = (_read_binary if suffix == ".bin" else _read_text)(camera_path, image_path)
         unknown = next((name for name, camera, _ in images if camera not in cameras), None)

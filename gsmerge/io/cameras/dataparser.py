@@ -55,7 +55,9 @@ def _read_offsets(folders: Sequence[Path]) -> list[Similarity]:
     offsets into text files, and DJI Terra writes an offset into metadata.xml. Each offset gives two moves of the
     cameras, in opposite directions, since the offset may be missing from the cameras or from the Gaussians.
     """
-    endings, max_files = (".txt", ".xml", ".xyz"), 8  # of files that may have an offset, and how many of these are read
+    # of files that may have an offset, and how many of these are read
+    endings = (".txt", ".xml", ".xyz")
+    max_files = 8
     paths = sorted({path for folder in folders for path in folder.glob("[!.]*") if path.suffix in endings})
     small = [path for path in paths if path.is_file() and os.access(path, os.R_OK) and path.stat().st_size <= 1 << 12]
     matches = [(path.name, _OFFSET.search(path.read_text("latin-1"))) for path in small[:max_files]]

@@ -23,7 +23,9 @@ class Foreign(NamedTuple):
 
 
 INTRINSICS = "intrinsic.txt"  # file of intrinsics beside the poses of DA3-Streaming
-_DEPTH, _MAX_PATHS = 3, 10_000  # most levels of folders, and most paths, that are searched for files of PROGRAMS
+# most levels of folders, and most paths, that are searched for files of PROGRAMS
+_DEPTH = 3
+_MAX_PATHS = 10_000
 _WRITE_POSES = (
     "write its poses into a transforms.json as nerfstudio has it, or into views.npz (docs/reference/formats.md)"
 )

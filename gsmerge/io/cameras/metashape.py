@@ -31,7 +31,8 @@ def list_metashape_cameras(source: CameraSource) -> list[Entry]:
     values: dict[str | None, dict[str, Any]] = {}  # id of a sensor -> its values
     entries = []
     for camera in (camera for camera in cameras if camera.get("component_id") in largest):
-        name, sensor_id = camera.get("label") or "", camera.get("sensor_id")
+        name = camera.get("label") or ""
+        sensor_id = camera.get("sensor_id")
         if sensor_id not in sensors:
             raise SceneError(path, f"view {name}: expected the id of one of the sensors, found {sensor_id!r}")
         if sensor_id not in values:
@@ -58,7 +59,8 @@ def _sensor_values(sensor: Element) -> dict[str, Any]:
     values: dict[str, Any] = {key: numbers[key] for key in ("cx", "cy", "k1", "k2", "k3", "k4") if key in numbers}
     # Metashape's p1 is OpenCV's p2, and its p2 is OpenCV's p1
     values |= {opencv: numbers[key] for key, opencv in (("p1", "p2"), ("p2", "p1")) if key in numbers}
-    fx, fy = numbers["f"] + numbers.get("b1", 0), numbers["f"]
+    fx = numbers["f"] + numbers.get("b1", 0)
+    fy = numbers["f"]
     values |= {"width": float(size["width"]), "height": float(size["height"]), "fx": fx, "fy": fy}
     return values | {"type": sensor.get("type", "frame")}
 
@@ -74,7 +76,9 @@ def _read_xml(path: Path, attributes: Collection[str]) -> Element:
     """
     text, builder, parser = read_text(path), TreeBuilder(), expat.ParserCreate()
     budget = read_budget(path)
-    element_bytes, attribute_bytes = 200, 330  # most bytes of memory for each "<" and "=" of a file
+    # most bytes of memory for each "<" and "=" of a file
+    element_bytes = 200
+    attribute_bytes = 330
     budget.check_memory(element_bytes * text.count("<") + attribute_bytes * text.count("="), "XML")
 
     def start(tag: str, stored: Mapping[str, str]) -> None:
@@ -84,7 +88,8 @@ def _read_xml(path: Path, attributes: Collection[str]) -> Element:
         raise SceneError(path, "expected XML without a document type, found <!DOCTYPE", "remove that line")
 
     parser.StartElementHandler, parser.EndElementHandler = start, builder.end
-    parser.CharacterDataHandler, parser.StartDoctypeDeclHandler = builder.data, refuse
+    parser.CharacterDataHandler = builder.data
+    parser.StartDoctypeDeclHandler = refuse
     parser.buffer_text = True
     try:
         parser.Parse(text, True)

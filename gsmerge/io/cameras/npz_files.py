@@ -36,7 +36,8 @@ from gsmerge.runtime.threads import quiet_warnings
 _LYRA = ("recon_sampled", "da3", "da3_pred")
 _EXTRINSICS = ("extrinsics", "exts", "extrinsic", *(f"w2c_{name}" for name in _LYRA))
 _INTRINSICS = ("intrinsics", "ixts", "intrinsic", *(f"intrinsics_{name}" for name in _LYRA))
-_IMAGES, _DEPTHS = ("image", "images"), ("depth", "depths")
+_IMAGES = ("image", "images")
+_DEPTHS = ("depth", "depths")
 _MAX_HEADER = 1 << 16  # most bytes of an array's header
 _KINDS = "biufU"  # NumPy's kinds of arrays that are read: numbers and text
 
@@ -75,7 +76,8 @@ def read_da3(source: CameraSource) -> StoredCameras:
         height, width = sized.shape[1:3]
         Ks = None if Ks is None else _at_size(Ks, width, height)
     elif Ks is not None:
-        width, height = round(2 * Ks[0, 0, 2]), round(2 * Ks[0, 1, 2])
+        width = round(2 * Ks[0, 0, 2])
+        height = round(2 * Ks[0, 1, 2])
     if width <= 1 and Ks is not None and not is_da3(path):  # AnySplat divides intrinsics by the size
         return StoredCameras(_make_views(poses, Ks, (0, 0)), photos, convention=C2W_OPENCV)
     shape = len(poses), height, width
@@ -91,7 +93,8 @@ def read_views_npz(source: CameraSource) -> StoredCameras:
     missing = [name for name in ("c2w", "images") if name not in arrays]
     if missing:
         raise _missing_arrays(path, missing, arrays)
-    poses, Ks = arrays["c2w"], arrays.get("K")
+    poses = arrays["c2w"]
+    Ks = arrays.get("K")
     _check_poses(path, poses, Ks, ("c2w [v,4,4]", "K [v,3,3]"))
     images = _as_images(path, arrays["images"], len(poses))
     order = str(arrays.get("order", "auto"))
@@ -173,7 +176,9 @@ def _at_size(Ks: np.ndarray, width: int, height: int) -> np.ndarray:
     is_normalised = (Ks[:, 0, 0] < MAX_NORMALISED_FOCAL) & (Ks[:, 0, 2] < 2) & (width > 10)
     # If a view's two ratios, for width and height, are equal but not 1, its intrinsics are for another image size. If
     # the two ratios differ, the principal point is not in the middle of the image
-    max_axis_difference, min_size_difference = 0.03, 0.1  # relative
+    # relative
+    max_axis_difference = 0.03
+    min_size_difference = 0.1
     are_equal = np.abs(ratios[:, 0] / ratios[:, 1] - 1) < max_axis_difference
     is_for_other_size = ~is_normalised & are_equal & (np.abs(ratios[:, 0] - 1) > min_size_difference)
     scaled = Ks.copy()
@@ -244,7 +249,8 @@ def _read_header(stream: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:
 def read_matrices(path: Path) -> np.ndarray | None:
     """Read matrices ``[c,4,4]`` from a ``.npy``; None if the file holds another array, NaN or inf."""
     with suppress(Exception):  # a damaged file may make the library raise any error
-        size, (shape, dtype) = check_file(path), _read_header(path.open("rb"))
+        size = check_file(path)
+        shape, dtype = _read_header(path.open("rb"))
         if dtype.kind == "f" and shape[1:] == (4, 4) and 0 < math.prod(shape) * dtype.itemsize <= size:
             matrices = np.load(path, allow_pickle=False).astype(np.float64)
             return matrices if np.isfinite(matrices).all() else None
@@ -262,11 +268,13 @@ def take_optimised_poses(source: CameraSource, views: list[StoredView]) -> list[
     last_path = max(paths, key=lambda path: natural_key(path.parent.name), default=None)
     if last_path is None:
         return views
-    original, optimised = read_matrices(last_path.with_name("pose_org.npy")), read_matrices(last_path)
+    original = read_matrices(last_path.with_name("pose_org.npy"))
+    optimised = read_matrices(last_path)
     if original is None or optimised is None or not len(original) == len(optimised) == len(views):
         return views
     try:
-        first_poses, poses = invert(original)[:, :3], invert(optimised)[:, :3]
+        first_poses = invert(original)[:, :3]
+        poses = invert(optimised)[:, :3]
     except np.linalg.LinAlgError:
         return views
     same_pose = 1e-4  # largest difference of numbers in two files with the same poses, absolute and relative

@@ -33,7 +33,8 @@ def read_poses(source: CameraSource) -> StoredCameras:
     size of the views is unknown. Raise SceneError if a line of poses has other than 12 or 16 numbers, or a line of
     intrinsics other than 4.
     """
-    path, intrinsics = source.path, source.path.parent / INTRINSICS
+    path = source.path
+    intrinsics = source.path.parent / INTRINSICS
     poses = _parse(path, read_lines(path), _POSE_COLUMNS)
     Ks: list[np.ndarray | None] = [None]
     if intrinsics.is_file():

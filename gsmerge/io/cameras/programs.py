@@ -36,7 +36,8 @@ def list_shots(source: CameraSource) -> list[Entry]:
     """List the views of OpenSfM's largest reconstruction, each with its camera. OpenSfM calls views shots."""
     with number_errors(source.path, "expected reconstructions of 'cameras' and 'shots'"):
         largest = max(source.json, key=lambda entry: len(entry["shots"]))
-        shots, cameras = dict(largest["shots"]), largest["cameras"]
+        shots = dict(largest["shots"])
+        cameras = largest["cameras"]
         check_camera_count(source.path, len(shots))
         for name, shot in shots.items():
             if shot["camera"] not in cameras:
@@ -49,7 +50,8 @@ def list_shots(source: CameraSource) -> list[Entry]:
 
 def list_keyframes(source: CameraSource) -> list[Entry]:
     """List the views in a folder of Polycam. Each view has a file, with a key for each number of its pose."""
-    paths, entries = natural_order(source.path.glob("*.json")), list[Entry]()
+    paths = natural_order(source.path.glob("*.json"))
+    entries = list[Entry]()
     check_camera_count(source.path, len(paths))
     for path in paths:
         with number_errors(path, f"view {path.stem}: expected an object with t_00 to t_23, among others"):
@@ -144,9 +146,12 @@ def read_sharp(source: CameraSource) -> StoredCameras | None:
             return None
     with np.errstate(all="ignore"):  # the check of all cameras refuses NaN
         numbers = {name: np.asarray([row[0] for row in elements[name].rows[:]], np.float64) for name in present}
-    extrinsic, intrinsic, size = numbers["extrinsic"], numbers["intrinsic"], numbers.get("image_size", np.zeros(0))
+    extrinsic = numbers["extrinsic"]
+    intrinsic = numbers["intrinsic"]
+    size = numbers.get("image_size", np.zeros(0))
     if len(intrinsic) == 4 and "image_size" not in numbers:  # first versions write focal lengths and size
-        focal_lengths, size = intrinsic[:2], intrinsic[2:]
+        focal_lengths = intrinsic[:2]
+        size = intrinsic[2:]
         intrinsic = make_pinhole(*focal_lengths, *(size / 2)).reshape(-1)
     sharp_layers = 2  # Gaussians in each cell of the grid, of a front and a back layer
     side = round((elements["vertex"].count / sharp_layers) ** 0.5)
@@ -155,7 +160,8 @@ def read_sharp(source: CameraSource) -> StoredCameras | None:
     if len(extrinsic) not in (12, 16) or len(intrinsic) != 9:
         problem = f"expected 16 and 9 numbers of a camera, found {len(extrinsic)} and {len(intrinsic)}"
         raise SceneError(source.path, problem)
-    pose, K = extrinsic.reshape(-1, 4).copy(), intrinsic.reshape(3, 3)
+    pose = extrinsic.reshape(-1, 4).copy()
+    K = intrinsic.reshape(3, 3)
     if len(extrinsic) == 12:  # first versions write the rotation column by column
         pose[:, :3] = pose[:, :3].T.copy()
     K = K * np.array([[side / size[0]], [side / size[1]], [1.0]])

@@ -82,7 +82,8 @@ def _has_views_with(source: CameraSource, key: str) -> bool:
 
 
 _array_names, _is_da3 = _lazy("npz_files.array_names"), _lazy("npz_files.is_da3")
-_READ_COLMAP, _read_da3 = _lazy("colmap.read_colmap"), _lazy("npz_files.read_da3")
+_READ_COLMAP = _lazy("colmap.read_colmap")
+_read_da3 = _lazy("npz_files.read_da3")
 _LISTS_POSES = _lazy("pose_lines.lists_poses")
 _read_state_views = LazyFunction("gsmerge.io.formats.gsm", "read_views")
 

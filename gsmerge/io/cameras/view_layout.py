@@ -207,7 +207,8 @@ def read_views(source: CameraSource, layout: ViewLayout) -> StoredCameras:
     cameras: list[tuple[Path, str, np.ndarray, dict[str, Any]]] = []
     for i, entry in enumerate(entries):
         names = (entry.values[key] for key in _alternatives(layout.name) if entry.values.get(key) not in (None, ""))
-        path, name = entry.path or source.path, entry.name or str(next(names, f"view {i}"))
+        path = entry.path or source.path
+        name = entry.name or str(next(names, f"view {i}"))
         missing: list[Key] = [key for key in layout.pose.keys if entry.values.get(key) is None]
         for key in required_keys:
             if _find_value(entry.values, key) is None and _find_value(entry.shared, key) is None:
@@ -308,20 +309,24 @@ def _intrinsics(
         raise SceneError(path, problem, "add them in pixels, for all views or for each")
     has_size = values.get("w") and values.get("h")
     if not has_size and not {"fx", "cx", "cy"} <= values.keys() and keys.get("w") in layout.optional:
-        w, h = repr(keys["w"]), repr(keys["h"])
+        w = repr(keys["w"])
+        h = repr(keys["h"])
         image = find_image(path.parent, name, path, remedy=f"add {w} and {h} to the camera file")
         if image is None:
             raise SceneError(path, f"view {name}: expected {w} and {h}, found neither them nor the image itself")
         values = values | dict(zip(("w", "h"), size_of(image), strict=True))
-    width, height = values.get("w", 0.0), values.get("h", 0.0)
+    width = values.get("w", 0.0)
+    height = values.get("h", 0.0)
     unit = max(width, height) if layout.unit == "larger side" else 1.0  # pixels
-    fx, fy = _focal(values, "x", width), _focal(values, "y", height)
+    fx = _focal(values, "x", width)
+    fy = _focal(values, "y", height)
     fx = fx or fy if layout.K.fx in layout.optional else fx
     fy = fy or fx if layout.K.fy in layout.optional else fy
     if layout.origin == "middle":
         cx, cy = (side / 2 + unit * values.get(key, 0.0) for key, side in (("cx", width), ("cy", height)))
     else:
-        cx, cy = values.get("cx", width / 2), values.get("cy", height / 2)
+        cx = values.get("cx", width / 2)
+        cy = values.get("cy", height / 2)
     return make_pinhole(unit * fx, unit * fy, cx, cy), values
 
 

@@ -40,7 +40,8 @@ def viewer_cameras(cameras: Cameras, names: Sequence[str]) -> str:
     :func:`gsmerge.read_cameras` reads this file. Viewers assume that the principal point is in the middle. A principal
     point elsewhere is written as ``cx`` and ``cy``, which viewers ignore.
     """
-    rotations, centres = cameras.viewmats[:, :3, :3].transpose(0, 2, 1), cameras.centres
+    rotations = cameras.viewmats[:, :3, :3].transpose(0, 2, 1)
+    centres = cameras.centres
     entries = list[dict[str, Any]]()
     for i, name in enumerate(names):
         K = cameras.Ks[i]
@@ -58,8 +59,10 @@ def order_views(cameras: Cameras) -> list[int]:
     """Return the numbers of the views, ordered by their distance from the median centre and the mean direction."""
     if len(cameras) == 0:
         return []
-    centres, forward = camera_centres(cameras.viewmats), cameras.viewmats[:, 2, :3]
-    offsets, deviations = centres - lower_median(centres), forward - normalize(forward.mean(0))
+    centres = camera_centres(cameras.viewmats)
+    forward = cameras.viewmats[:, 2, :3]
+    offsets = centres - lower_median(centres)
+    deviations = forward - normalize(forward.mean(0))
     distances, turns = (np.sqrt((rows * rows).sum(1)) for rows in (offsets, deviations))
     return np.argsort(distances / (distances.mean() or 1.0) + turns, kind="stable").tolist()
 
@@ -83,7 +86,8 @@ def viewer_settings(cameras: Cameras, means: np.ndarray) -> str:
     viewer would move its camera if the settings had no track.
     """
     view = order_views(cameras)[0]
-    forward, centre = cameras.viewmats[view, 2, :3].astype(np.float64), cameras.centres[view].astype(np.float64)
+    forward = cameras.viewmats[view, 2, :3].astype(np.float64)
+    centre = cameras.centres[view].astype(np.float64)
     num_sampled = 10_000  # Gaussians from which a depth is estimated
     depths = ((means[:: max(1, len(means) // num_sampled)] - centre) * forward).sum(1)
     depth = float(np.median(depths[depths > 0])) if (depths > 0).any() else 1.0
