@@ -164,12 +164,16 @@ def _recover_pixels(source: RowSource, grid: Grid) -> Recovery | None:
     """Find the pixels of the rows in a grid, and the frame of its cameras; None if the rows are not pixels in order."""
     if source.order == "none":
         return None
-    count, num_pixels = len(source.ply.gaussians), len(grid.cameras) * math.prod(grid.size)
-    layout, layers = Layout(len(grid.cameras), *grid.size), count // num_pixels  # layers: whole rows per pixel
+    count = len(source.ply.gaussians)
+    num_pixels = len(grid.cameras) * math.prod(grid.size)
+    # layers: whole rows per pixel
+    layout = Layout(len(grid.cameras), *grid.size)
+    layers = count // num_pixels
     if source.camera_file.pixel_ids is not None:
         layouts = [replace(layout, ids=source.camera_file.pixel_ids)]
     elif count != layers * num_pixels or source.order == "view-fastest":  # some pixels may have no row
-        recovery, own = _follow_order(source, grid, exporter_frames(grid.cameras, source.scale)), None
+        recovery = _follow_order(source, grid, exporter_frames(grid.cameras, source.scale))
+        own = None
         if recovery is None:  # the frame in which the cameras fit cameras that are estimated from the rows
             own = source.own_cameras
         if own is not None and len(own) == len(grid.cameras):
@@ -184,7 +188,8 @@ def _recover_pixels(source: RowSource, grid: Grid) -> Recovery | None:
         rows = np.arange(count)
         layouts = [replace(layout, ids=ids) for ids in (rows // layers, rows % num_pixels)]
     # at least min_rows rows have to be finite, or the share min_share of all rows if that is less
-    min_rows, min_share = 24, 0.05
+    min_rows = 24
+    min_share = 0.05
     if int(source.ply.valid.sum()) < min(min_rows, min_share * count):
         return None
     return next(filter(None, (_place_layout(source, grid, layout) for layout in layouts)), None)
@@ -237,7 +242,8 @@ def _place_layout(source: RowSource, grid: Grid, layout: Layout) -> Recovery | N
     moved_gaussians = 2000  # Gaussians of a view that its moved pose is solved from
     more_pairs = inputs.pairs(layout, moved_gaussians)
     if check_pairs(more_pairs, grid.cameras).worst_px <= max_correctable_px(*grid.size):
-        path, names = str(source.camera_file.path), source.camera_file.names
+        path = str(source.camera_file.path)
+        names = source.camera_file.names
         moved = move_cameras(more_pairs, grid.cameras, names, path, source.inputs(grid).images)
         if moved is not None:  # photos may confirm the poses as read
             confirmed, moves = (grid.cameras.viewmats, ()) if moved.confirmed else (None, moved.moves)
@@ -257,7 +263,9 @@ def _follow_order(source: RowSource, grid: Grid, frames: Sequence[Similarity]) -
         return None  # there are more rows than pixels, or too many to follow
     orders = [order for order in ("view-major", "view-fastest") if source.order in ("auto", order)]
     points = np.ascontiguousarray(source.ply.gaussians.means[rows], np.float32)
-    first_rows, min_placed = 20_000, 0.99  # rows that are followed first, and the share of rows that must have a pixel
+    # rows that are followed first, and the share of rows that must have a pixel
+    first_rows = 20_000
+    min_placed = 0.99
     for frame, order in itertools.product(frames, orders):
         placed = replace(grid, frame=frame, shown_by=_EVIDENCE)
         cameras = placed.placed
@@ -290,12 +298,16 @@ def _align_without_pixels(source: RowSource, grid: Grid, frames: Callable[[], Se
     if source.scale is not None:
         grid = replace(grid, cameras=scale_by(source.scale).move_cameras(grid.cameras))
     # the error of rows that are not the pixels of the cameras states both numbers
-    views, (width, height), count = len(grid.cameras), grid.size, source.ply.info.count
+    views = len(grid.cameras)
+    width, height = grid.size
+    count = source.ply.info.count
     expected = f"{views} x {height} x {width} = {views * height * width} (views x height x width)"
     actual = f"{count} in no known order" if count == views * height * width else str(count)
     problem = f"expected one Gaussian per pixel, {expected}, found {actual}"
     remedy = "give the cameras of their views, in the frame of the Gaussians"
-    no_pixels, sight, notes_on_choice = SceneError(source.ply.info.path, problem, remedy), None, list[str]()
+    no_pixels = SceneError(source.ply.info.path, problem, remedy)
+    sight = None
+    notes_on_choice = list[str]()
     rotation = upright_rotation(inputs)
     if rotation is None:
         placed = replace(inputs, cameras=grid.cameras)
@@ -303,7 +315,8 @@ def _align_without_pixels(source: RowSource, grid: Grid, frames: Callable[[], Se
     else:
         upright = solve_upright(inputs, rotation, source.ply.info.path)
         grid = replace(grid, frame=upright, shown_by="photos' colours")
-    cameras, camera_file = grid.placed, grid.camera_file
+    cameras = grid.placed
+    camera_file = grid.camera_file
     if grid.frame is not IDENTITY:
         recovery = None if source.order == "none" else _follow_order(source, grid, [grid.frame])
         if recovery is not None:  # the rows alone did not show their scale, but the photos did
@@ -325,8 +338,11 @@ def _align_without_pixels(source: RowSource, grid: Grid, frames: Callable[[], Se
 
 def _make_alignment(source: RowSource, recovery: Recovery) -> AlignmentResult:
     """Make the result for rows that are pixels, with cameras and poses in the frame of the Gaussians."""
-    grid, camera_file = recovery.grid, source.camera_file
-    inputs, notes, confirmed = source.inputs(grid), grid.list_notes(camera_file.convention), grid.confirmed_viewmats
+    grid = recovery.grid
+    camera_file = source.camera_file
+    inputs = source.inputs(grid)
+    notes = grid.list_notes(camera_file.convention)
+    confirmed = grid.confirmed_viewmats
     free_pages(vars(inputs.gaussians).values())  # the search has read all rows
     if camera_file.source == ESTIMATED:
         focals_differ = len(set(map(bytes, camera_file.Ks))) > 1

@@ -32,7 +32,8 @@ from gsmerge.types import Cameras
 
 _FREE_INTRINSICS = (ONE_FOCAL, TWO_FOCALS, ALL_INTRINSICS)
 # A point is far from its pixel if its distance is above _FAR times the median distance, and above _FAR_PX pixels
-_FAR, _FAR_PX = 3.0, 1.0
+_FAR = 3.0
+_FAR_PX = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,8 +72,10 @@ def calibrate(pairs: Correspondences, width: int, height: int) -> Cameras | None
     views = [pairs.select(pairs.views == view) for view in view_ids]
     middle = np.median(pairs.points, 0)
     unit = float(np.median(np.abs(pairs.points - middle))) or 1.0
-    points, pixels = [(view.points - middle) / unit for view in views], [view.pixels for view in views]
-    limit_px, projective_px = pixel_limit(width, height), max(map(projective_error, points, pixels), default=math.inf)
+    points = [(view.points - middle) / unit for view in views]
+    pixels = [view.pixels for view in views]
+    limit_px = pixel_limit(width, height)
+    projective_px = max(map(projective_error, points, pixels), default=math.inf)
     # the simplest intrinsics that explain the pixels
     models: list[_Model] = []
     if projective_px <= limit_px:
@@ -124,7 +127,8 @@ def _solve_models(
     for free in _FREE_INTRINSICS if len(points) > 1 else ():
         view_starts = (replace(model, Ks=model.Ks[v : v + 1], poses=model.poses[v : v + 1]) for v in range(len(points)))
         views = [_fit_model([p], [q], start, free) for p, q, start in zip(points, pixels, view_starts, strict=True)]
-        Ks, poses = np.concatenate([view.Ks for view in views]), np.concatenate([view.poses for view in views])
+        Ks = np.concatenate([view.Ks for view in views])
+        poses = np.concatenate([view.poses for view in views])
         model = _Model(Ks, poses, free * len(views), tuple(view.errors[0] for view in views))
         yield model
 
@@ -134,7 +138,10 @@ def _fit_model(points: Sequence[np.ndarray], pixels: Sequence[np.ndarray], start
 
     Raises numpy.linalg.LinAlgError if the points do not determine poses and intrinsics.
     """
-    K, poses, near_points, near_pixels = start.Ks[0], start.poses, points, pixels
+    K = start.Ks[0]
+    poses = start.poses
+    near_points = points
+    near_pixels = pixels
     rounds = 2  # rounds of solving; the second leaves out points that are far from their pixels after the first
     for _ in range(rounds):
         K, poses = refine_poses(near_points, near_pixels, K, poses, free=free)

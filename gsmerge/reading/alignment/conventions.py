@@ -61,7 +61,8 @@ def other_conventions(viewmats: np.ndarray, convention: Convention) -> list[Pose
     ``viewmats [c,4,4]`` are the poses of the file in ``convention``. Poses that are equal in two conventions are listed
     once.
     """
-    stored, all_poses = from_viewmats(viewmats, convention), [PosesInConvention(convention, viewmats)]
+    stored = from_viewmats(viewmats, convention)
+    all_poses = [PosesInConvention(convention, viewmats)]
     tolerance = 1e-6  # tolerance for equal poses, relative to the largest number in them
     for other in CONVENTIONS:
         converted = to_viewmats(stored, other)
@@ -113,7 +114,8 @@ def move_cameras(
     if not before.worst_px <= max_correctable_px(cameras.width, cameras.height):
         return None
     # each camera that is near_px or more off is moved to its own Gaussians
-    viewmats, errors = cameras.viewmats.astype(np.float64), pixel_errors(pairs, cameras)
+    viewmats = cameras.viewmats.astype(np.float64)
+    errors = pixel_errors(pairs, cameras)
     near_px = 0.5  # cameras with smaller errors are not moved
     for view in np.unique(pairs.views):
         if np.median(errors[pairs.views == view]) > near_px:
@@ -162,7 +164,8 @@ def _measure_disagreement(points: np.ndarray, pairs: Correspondences, images: np
     pixels of other views to which its position in ``points [t,3]`` projects.
     """
     x, y = pairs.pixels.astype(np.int64).T
-    own_colors, errors = photo_colors(images, pairs.views, y, x), []
+    own_colors = photo_colors(images, pairs.views, y, x)
+    errors = []
     for view in range(len(cameras)):
         with np.errstate(all="ignore"):
             xy, depth = project_points(points, cameras.viewmats[view], cameras.Ks[view])
@@ -183,9 +186,11 @@ def _fit_intrinsics(pairs: Correspondences, cameras: Cameras, moved_px: float) -
     with np.errstate(all="ignore"):
         xy, depth = project_points(pairs.points[:, None], cameras.viewmats[pairs.views], cameras.Ks[pairs.views])
     in_front = (depth[:, 0] > 0) & np.isfinite(xy[:, 0]).all(1)
-    projected, pixels = xy[in_front, 0], pairs.pixels[in_front]
+    projected = xy[in_front, 0]
+    pixels = pairs.pixels[in_front]
     # x and y have separate fits of lines, because a point may fit in x but not in y
-    factors, shifts = np.empty(2), np.empty(2)
+    factors = np.empty(2)
+    shifts = np.empty(2)
     line_rounds = 4  # number of rounds of reweighted least squares
     for axis in range(2):
         x, y = (np.ascontiguousarray(values[:, axis]) for values in (projected, pixels))
@@ -193,7 +198,8 @@ def _fit_intrinsics(pairs: Correspondences, cameras: Cameras, moved_px: float) -
         with np.errstate(all="ignore"):
             for _ in range(line_rounds):
                 mean_x, mean_y = ((weights * values).sum() / weights.sum() for values in (x, y))
-                dx, dy = x - mean_x, y - mean_y
+                dx = x - mean_x
+                dy = y - mean_y
                 factors[axis] = (weights * dx * dy).sum() / (weights * dx**2).sum()
                 shifts[axis] = mean_y - factors[axis] * mean_x
                 weights = robust_weights(np.abs(y - factors[axis] * x - shifts[axis]), 3, 1e-9)

@@ -24,18 +24,23 @@ from gsmerge.reading.alignment.resection import projective_camera
 from gsmerge.reading.alignment.score import find_correspondences, is_as_near
 from gsmerge.types import Cameras
 
-_MIN_SIDE, _MAX_WIDTH = 16, 2048  # fewest and most pixels of a line
+# fewest and most pixels of a line
+_MIN_SIDE = 16
+_MAX_WIDTH = 2048
 # A length of lines is tried if at least the share _MIN_SHARE of the sampled rows shows it. At most _MAX_LENGTHS lengths
 # are tried
-_MIN_SHARE, _MAX_LENGTHS = 0.02, 2
+_MIN_SHARE = 0.02
+_MAX_LENGTHS = 2
 # The step from the end of a line back to the left edge is at least _WRAP times the usual step. The step from the first
 # point of a line to the first point of the next line is at most _BELOW times the step back to the left edge
-_WRAP, _BELOW = 8.0, 0.25
+_WRAP = 8.0
+_BELOW = 0.25
 _MIN_LINES = 6  # fewest complete lines in a series
 _SOLVED_FROM = 800  # rows of a view that its camera is solved from
 _MAX_PX = 1.0  # largest median distance of a view's rows from their pixels
 # A camera that was solved from n lines is used for the next _AHEAD * n lines, but for at least _MIN_AHEAD lines
-_AHEAD, _MIN_AHEAD = 0.3, 2
+_AHEAD = 0.3
+_MIN_AHEAD = 2
 _MIN_PLACED = 0.9  # share of the rows that must have a pixel
 
 
@@ -48,7 +53,8 @@ def estimate_cameras(path: Path, means: np.ndarray, valid: np.ndarray) -> Camera
     # The step in rows from a pixel to the next pixel of the same view: at this distance in rows, pairs of points are
     # nearest to each other. The step is the number of views if rows are sorted by line, column and view. For other
     # rows, and for few rows, the step is 1
-    rows, step = np.arange(len(means)), 1
+    rows = np.arange(len(means))
+    step = 1
     most_views = 64  # largest step that is tried
     min_pixels = 256  # fewest pixels of a view
     longest = min(most_views, len(means) // min_pixels)
@@ -114,7 +120,9 @@ def _find_line_lengths(points: np.ndarray) -> list[int]:
     def find_nearest(start: int) -> int:
         """Return the distance in rows from a row to its nearest neighbour at least _MIN_SIDE rows later."""
         rows = slice(start + _MIN_SIDE, start + longest)
-        dx, dy, dz = x[rows] - x[start], y[rows] - y[start], z[rows] - z[start]
+        dx = x[rows] - x[start]
+        dy = y[rows] - y[start]
+        dz = z[rows] - z[start]
         return _MIN_SIDE + int(np.argmin(dx * dx + dy * dy + dz * dz))
 
     counts = np.bincount([find_nearest(start) for start in starts], minlength=2 * longest)
@@ -141,7 +149,9 @@ def _find_views(points: np.ndarray, length: int) -> list[_GridView]:
     ``points [n,3]`` are the means of all rows. Each view is extended from a series of complete lines. A series is left
     out if it fits its camera worse than the best series fits its camera.
     """
-    num_first, max_series = 12, 200  # the measure is the best of the first num_first series; at most max_series count
+    # the measure is the best of the first num_first series; at most max_series count
+    num_first = 12
+    max_series = 200
     series = _find_lines(points, length)[:max_series]
     first_views = [_solve_lines(points, starts) for starts in series[:num_first]]
     best_px = min((view.px for view in first_views if view is not None), default=None)
@@ -175,7 +185,9 @@ def _find_lines(points: np.ndarray, length: int) -> list[np.ndarray]:
     if len(rows) * length > max_jumps * len(points):
         return []
     # the line before each line, or -1 for none; it begins `length` rows earlier, and is the nearest of these
-    firsts, before, least = points[rows], np.full(len(rows), -1), _BELOW * steps[rows - 1]
+    firsts = points[rows]
+    before = np.full(len(rows), -1)
+    least = _BELOW * steps[rows - 1]
     for back in range(1, len(rows)):
         apart = rows[back:] - rows[:-back]
         if apart.min() > length:
@@ -183,13 +195,16 @@ def _find_lines(points: np.ndarray, length: int) -> list[np.ndarray]:
         ids = np.flatnonzero(apart == length)
         distances = np.linalg.norm(firsts[ids + back] - firsts[ids], axis=1)
         closer = distances < least[ids + back]
-        ids, distances = ids[closer], distances[closer]
-        before[ids + back], least[ids + back] = ids, distances
+        ids = ids[closer]
+        distances = distances[closer]
+        before[ids + back] = ids
+        least[ids + back] = distances
     # series of consecutive lines
     num_before = np.zeros(len(rows), np.int64)  # number of lines before each line in its series
     for i, previous in enumerate(before.tolist()):
         num_before[i] = num_before[previous] + 1 if previous >= 0 else 0
-    series, used = [], np.zeros(len(rows), bool)
+    series = []
+    used = np.zeros(len(rows), bool)
     for last in np.argsort(-num_before, kind="stable").tolist():
         if num_before[last] < _MIN_LINES:
             break
@@ -231,14 +246,18 @@ def _extend_view(points: np.ndarray, free: np.ndarray, view: _GridView, width: i
     ``free [n]`` is True for rows that no other view has. ``width`` is the length of a line in rows.
     """
     first, last = view.rows[[0, -1]]
-    before, after = np.flatnonzero(~free[:first]), np.flatnonzero(~free[last:])
+    before = np.flatnonzero(~free[:first])
+    after = np.flatnonzero(~free[last:])
     # the free rows around the view
-    low, high = int(before[-1]) + 1 if len(before) else 0, int(last + after[0]) if len(after) else len(free)
+    low = int(before[-1]) + 1 if len(before) else 0
+    high = int(last + after[0]) if len(after) else len(free)
     max_lost = 16  # after more consecutive rows without a pixel, another view begins
     while True:
-        top, num_lines = int(view.y.min()), int(np.ptp(view.y)) + 1
+        top = int(view.y.min())
+        num_lines = int(np.ptp(view.y)) + 1
         ahead = max(_MIN_AHEAD, int(_AHEAD * num_lines))  # lines that are tried on both sides
-        first, last = max(low, view.rows[0] - ahead * width), min(high, view.rows[-1] + 1 + ahead * width)
+        first = max(low, view.rows[0] - ahead * width)
+        last = min(high, view.rows[-1] + 1 + ahead * width)
         count_from_first_line = np.array([[1.0, 0, 0], [0, 1, ahead - top], [0, 0, 1]])
         viewmat = np.concatenate([view.camera, [[0, 0, 0, 1]]])
         tried = np.ascontiguousarray(points[first:last], np.float32)
@@ -260,7 +279,8 @@ def follow_rows(
     The cameras are ``viewmats [v,4,4]`` and ``Ks [v,3,3]``. Rows out of order get the pixel -1. Pixels are in the order
     of view, line and column, or with ``mixed``, of line, column and view.
     """
-    count, views = len(points), len(viewmats)
+    count = len(points)
+    views = len(viewmats)
     ids = np.empty(count, np.int64)
     scratch_of_rows = np.empty(count, np.int64), np.empty(count, np.int32), np.empty(count * views, np.int32)
     scratch = *scratch_of_rows, np.empty(views, np.int64), np.empty(views, np.int32)

@@ -21,7 +21,8 @@ def refuse_other_cameras(inputs: AlignmentInput, camera_file: CameraFile) -> Non
     if len(inputs.gaussians) != len(cameras) * cameras.width * cameras.height:
         return  # the rows cannot be all pixels in order
     pairs = sample_pixels(inputs.gaussians, cameras, inputs.valid)
-    alignment, first_view = check_pairs(pairs, cameras), pairs.select(pairs.views == 0)
+    alignment = check_pairs(pairs, cameras)
+    first_view = pairs.select(pairs.views == 0)
     if float(np.nanmedian([*alignment.median_px, np.inf])) < alignment.limit_px:
         return  # most of the cameras fit
     max_multiple = 4.0  # rows nearer than this multiple of the limit are the pixels of some projective camera
@@ -51,7 +52,9 @@ def explain_misalignment(gaussians: Gaussians, cameras: Cameras, valid: np.ndarr
 
     ``valid [n]`` is True for rows that are visible Gaussians.
     """
-    views, width, height = len(cameras), cameras.width, cameras.height
+    views = len(cameras)
+    width = cameras.width
+    height = cameras.height
     rows = np.arange(len(gaussians))
     orders = {
         "row, column, view (view fastest)": rows.reshape(height, width, views).transpose(2, 0, 1),

@@ -47,7 +47,9 @@ def exporter_frames(cameras: Cameras, scale: float | None = None) -> list[Simila
     The frame of the cameras itself comes first, and the frame of the first camera last. ``scale`` is the length of one
     unit of the cameras' world in the world of the Gaussians, if it is known.
     """
-    unit, first, middle = scale or 1.0, cameras.viewmats[0], cameras.viewmats[len(cameras) // 2]
+    unit = scale or 1.0
+    first = cameras.viewmats[0]
+    middle = cameras.viewmats[len(cameras) // 2]
     rotations = (
         (first[:3, :3], "rotated into the first camera"),
         (middle[:3, :3], "rotated into the middle camera"),
@@ -67,7 +69,8 @@ def quarter_turns() -> list[Similarity]:
     """List the turns of the world by 90, 180 and 270 degrees about each axis, as from y up to z up."""
     turns = list[Similarity]()
     for axis, name in enumerate("xyz"):
-        first, second = (axis + 1) % 3, (axis + 2) % 3
+        first = (axis + 1) % 3
+        second = (axis + 2) % 3
         for degrees, cosine, sine in ((90, 0, 1), (180, -1, 0), (270, 0, -1)):
             rotation = np.eye(3)
             rotation[[first, second, first, second], [first, second, second, first]] = cosine, cosine, -sine, sine
@@ -110,16 +113,20 @@ def solve_frame(
     # ray
     projections = np.eye(3) - rays[:, :, None] * rays[:, None, :]
     columns = [transform(projections, centres)[:, :, None], projections]
-    A, b = np.concatenate(columns, 2), transform(projections, points)
-    weights, solution = np.ones(len(points)), np.zeros(A.shape[2])
+    A = np.concatenate(columns, 2)
+    b = transform(projections, points)
+    weights = np.ones(len(points))
+    solution = np.zeros(A.shape[2])
     for _ in range(_ROUNDS):
         weighted = (A * weights[:, None, None]).reshape(-1, A.shape[2])
-        normal, target = matmul(weighted.T, A.reshape(-1, A.shape[2])), matmul(weighted.T, b.reshape(-1))
+        normal = matmul(weighted.T, A.reshape(-1, A.shape[2]))
+        target = matmul(weighted.T, b.reshape(-1))
         unit = np.sqrt(np.maximum(np.diag(normal), 1e-300))
         solution = solve_symmetric(normal / np.outer(unit, unit), target / unit) / unit
         if not np.isfinite(solution).all() or solution[0] <= 0:
             return None
-        scale, shift = solution[0], solution[1:]
+        scale = solution[0]
+        shift = solution[1:]
         from_centres = points - scale * centres - shift
         depth = np.abs((from_centres * rays).sum(1)) + 1e-12
         angle = np.linalg.norm(transform(projections, from_centres), axis=1) / depth
@@ -130,14 +137,18 @@ def solve_frame(
 def solve_pose(pairs: Correspondences, view: int, K: np.ndarray) -> np.ndarray | None:
     """Solve for the world-to-camera matrix ``[4,4]`` of a view from its own pixels; None if that fails."""
     rows = np.flatnonzero(pairs.views == view)
-    min_points, max_points = 6, 2000  # least and most points that a camera's pose is solved from
+    # least and most points that a camera's pose is solved from
+    min_points = 6
+    max_points = 2000
     rows = rows[:: max(1, len(rows) // max_points)]
     if len(rows) < min_points:
         return None
-    points, pixels = pairs.points[rows], pairs.pixels[rows]
+    points = pairs.points[rows]
+    pixels = pairs.pixels[rows]
     middle = medians(points)
     unit = median(np.abs(points - middle)) or 1.0
-    points, K = (points - middle) / unit, K.astype(np.float64)
+    points = (points - middle) / unit
+    K = K.astype(np.float64)
     for _ in range(2):  # the second round leaves out points far from their pixels
         start = start_pose(points, pixels, K)
         if start is None:
@@ -145,7 +156,8 @@ def solve_pose(pairs: Correspondences, view: int, K: np.ndarray) -> np.ndarray |
         pose = start
         errors = projection_errors(points, pixels, K, pose)
         is_near = errors <= max(1.0, 3 * median(errors))
-        points, pixels = points[is_near], pixels[is_near]
+        points = points[is_near]
+        pixels = pixels[is_near]
     try:
         _, (pose,) = refine_poses([points], [pixels], K, pose[None])
     except np.linalg.LinAlgError:  # points in one place

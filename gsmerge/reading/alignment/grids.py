@@ -51,7 +51,8 @@ class Grid:
 
     def list_notes(self, usual: Convention) -> list[str]:
         """List notes on what was changed in the cameras. ``usual`` is the pose convention of the file's format."""
-        notes, convention = [*self.remarks], self.camera_file.convention
+        notes = [*self.remarks]
+        convention = self.camera_file.convention
         if convention != usual:
             fits = f"the poses fit when read as {describe_convention(convention)}"
             notes.append(f"{fits}, where this format has {usual[0]} with {usual[1]} axes: read so")
@@ -112,7 +113,9 @@ def list_grids(camera_file: CameraFile, size: Size | None, num_rows: int) -> lis
         return [Grid(camera_file, to_cameras(camera_file), None, ())]
     if camera_file.photo_map is not None:  # the size of photos, and how they are resized and cropped to the grid
         return [_mapped_grid(camera_file, size, *camera_file.photo_map)]
-    stored, (width, height), grids = sizes_of(camera_file), size, list[Grid]()
+    stored = sizes_of(camera_file)
+    width, height = size
+    grids = list[Grid]()
     mismatch = next((camera_size for camera_size in stored if not same_shape(camera_size, size)), None)
     if mismatch is None:
         scaled = [camera_size for camera_size in stored if camera_size != size]
@@ -161,7 +164,8 @@ def _grid_of_size(camera_file: CameraFile, size: Size, grid_size: Size, words: s
 
     Photos that are much smaller than the grid are previews.
     """
-    cameras, transform = to_cameras(camera_file, grid_size), resize_to(size, grid_size)
+    cameras = to_cameras(camera_file, grid_size)
+    transform = resize_to(size, grid_size)
     photos = "photos of {} x {} are".format(*size)
     if max(transform.scale_x, transform.scale_y) > MAX_ENLARGED:
         small = "much smaller than the Gaussian grid of {} x {}, so Gaussians keep their own colours".format(*grid_size)
@@ -175,7 +179,8 @@ def _mapped_grid(camera_file: CameraFile, size: Size, file_size: Size, file_tran
     ``file_transform`` transforms photos of ``file_size``. The photos in memory have ``size``, which may be smaller.
     """
     ratio_x, ratio_y = (file_side / side for file_side, side in zip(file_size, size, strict=True))
-    scale_x, scale_y = ratio_x * file_transform.scale_x, ratio_y * file_transform.scale_y
+    scale_x = ratio_x * file_transform.scale_x
+    scale_y = ratio_y * file_transform.scale_y
     transform = replace(file_transform, scale_x=scale_x, scale_y=scale_y)
     note = f"photos of {file_size[0]} x {file_size[1]} are {transform.description}, the Gaussian grid's size"
     max_difference = 0.1  # few models resize width and height by factors with a larger relative difference

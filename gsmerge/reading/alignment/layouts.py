@@ -41,7 +41,8 @@ class Layout:
 
     def sample(self, per_view: int) -> tuple[np.ndarray, np.ndarray]:
         """Choose about ``per_view`` rows of each view, spread over columns and lines; return ``[t]`` rows, pixels."""
-        area, parts = self.width * self.height, []
+        area = self.width * self.height
+        parts = []
         if self.ids is None:
             pixels = np.arange(0, area, spread_step(-(-area // per_view), self.width))
             rows = (np.arange(self.views)[:, None] * area + pixels).reshape(-1)

@@ -14,7 +14,9 @@ from gsmerge.method.kernels.matrices import eigh, matmul, solve
 
 POSE_DAMPING = Damping(steps=30, first=1e-3, decrease=0.1, increase=10.0, largest=1e8, min_gain=1e-10)
 # Numbers of intrinsics that are solved for: fx = fy; or fx and fy; or fx, fy, cx and cy
-ONE_FOCAL, TWO_FOCALS, ALL_INTRINSICS = 1, 2, 4
+ONE_FOCAL = 1
+TWO_FOCALS = 2
+ALL_INTRINSICS = 4
 # Intrinsics, poses, and their curvature, slope and squared error; see _linearise
 _PoseFit = tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray, float]]
 
@@ -76,9 +78,12 @@ def _linearise(
     The other f = ``free`` parameters are logarithms of focal lengths, and then the principal point.
     """
     size = 6 + free
-    curvature, slope, error = np.empty((len(poses), size, size)), np.empty((len(poses), size)), 0.0
+    curvature = np.empty((len(poses), size, size))
+    slope = np.empty((len(poses), size))
+    error = 0.0
     for view, pose in enumerate(poses):
-        jacobian, residual = np.empty((2 * len(points[view]), size)), np.empty(2 * len(points[view]))
+        jacobian = np.empty((2 * len(points[view]), size))
+        residual = np.empty(2 * len(points[view]))
         inputs = (np.ascontiguousarray(array, np.float64) for array in (points[view], pixels[view], K, pose))
         reproject.linearise(*inputs, jacobian, residual)  # fills `jacobian` and `residual`
         with np.errstate(all="ignore"):  # points in the plane of the camera overflow
@@ -94,7 +99,8 @@ def _solve_normal_equations(curvature: np.ndarray, slope: np.ndarray, damping: f
     """
     size = curvature.shape[1]
     damped = curvature + damping * np.eye(size) * curvature
-    pose_slope, mixed = slope[:, :6, None], damped[:, :6, 6:]
+    pose_slope = slope[:, :6, None]
+    mixed = damped[:, :6, 6:]
     if size == 6:  # no intrinsics are free, so each view has a solution of its own
         return np.empty(0), -solve(damped, pose_slope)[..., 0]
     # the Schur complement eliminates the poses
@@ -154,14 +160,16 @@ def projective_camera(points: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarra
     used = values > flatness * values[-1]  # points in a plane or on a line do not determine the other axes
     basis = axes[:, used] / np.sqrt(values[used])
     local = matmul(homogeneous, basis)
-    centre, size = pixels.mean(0), float(pixels.std()) or 1.0
+    centre = pixels.mean(0)
+    size = float(pixels.std()) or 1.0
     targets = (pixels - centre) / size
     zero = np.zeros_like(local)
     # for each point two linear equations of the camera, which hold if it projects to x, and to y, of its pixel
     of_x = np.concatenate([local, zero, -targets[:, :1] * local], 1)
     of_y = np.concatenate([zero, local, -targets[:, 1:] * local], 1)
     weights = np.ones(len(points))
-    camera, error = np.zeros((3, local.shape[1])), np.full(len(points), np.inf)
+    camera = np.zeros((3, local.shape[1]))
+    error = np.full(len(points), np.inf)
     projective_rounds = 8  # number of rounds of reweighted least squares
     smallest_error = 1e-6  # added to errors and depths; unit: standard deviation of the pixels
     for _ in range(projective_rounds):

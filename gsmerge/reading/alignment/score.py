@@ -18,11 +18,15 @@ SHUFFLED_MARGIN = 5.0  # factor by which Gaussians must be nearer to their pixel
 # Two medians of some 400 distances differ by chance. The median of n distances in a plane has a relative standard error
 # of 0.72 / sqrt(n), so the ratio of two medians has a standard error of 5 %, and a ratio of 1.15 is three standard
 # errors above 1. Files round the numbers of cameras, which displaces projections by up to 0.02 pixels
-AS_NEAR, AS_NEAR_PX = 1.15, 0.02
-SCORED_GAUSSIANS, MIN_SCORED_GAUSSIANS = 6000, 60  # Gaussians of a score: in all views, and at least in each view
+AS_NEAR = 1.15
+AS_NEAR_PX = 0.02
+# Gaussians of a score: in all views, and at least in each view
+SCORED_GAUSSIANS = 6000
+MIN_SCORED_GAUSSIANS = 60
 MAX_CHECKED = 5_000  # pixels per view that an alignment is checked on
 # Moving a camera may correct an error of up to MAX_PX pixels and up to the share MAX_SHARE of the image's side
-MAX_PX, MAX_SHARE = 12.0, 0.05
+MAX_PX = 12.0
+MAX_SHARE = 0.05
 MAX_MEDIAN_PX = 1.5  # networks move a Gaussian within its pixel, and some of them a little beyond
 
 
@@ -140,7 +144,8 @@ def check_pixels(scene: Scene) -> Alignment:
     Only the foremost Gaussian of a pixel counts.
     """
     free_pages(vars(scene.gaussians).values())  # earlier steps have read all rows, and a sample is enough here
-    width, views = scene.cameras.width, len(scene)
+    width = scene.cameras.width
+    views = len(scene)
     step = spread_step(-(-scene.pixels_per_view // MAX_CHECKED), width)
     sample = np.arange(0, scene.pixels_per_view, step)
     fronts = scene.get_pixels().fronts.reshape(views, -1)[:, sample]

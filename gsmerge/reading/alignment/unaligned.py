@@ -23,7 +23,8 @@ from gsmerge.types import Cameras, Gaussians
 RANDOM_SHARE = 0.85
 # Least score of another convention, divided by the score of the usual convention: _MARGIN if colours are not compared,
 # _COLOR_MARGIN if they are
-_COLOR_MARGIN, _MARGIN = 1.3, 2.0
+_COLOR_MARGIN = 1.3
+_MARGIN = 2.0
 _FRAME_GAIN = 1.1  # least score of another frame, divided by the score of the cameras as they are
 _SEEN_GAUSSIANS = 20_000  # number of Gaussians that are projected, to estimate the share that cameras see
 # Number of Gaussians whose colours are compared in other conventions and frames. It gives scores an error of 0.4 %,
@@ -32,7 +33,8 @@ _COMPARED_GAUSSIANS = 5000
 MAX_FRONT_RATIO = 0.5  # like RANDOM_SHARE, but only for the foremost Gaussians, in a frame that was chosen by colours
 # A Gaussian counts as foremost if its depth is at most _FRONT times the least depth in its cell. A cell has _PER_CELL
 # Gaussians on average
-_FRONT, _PER_CELL = 1.05, 3
+_FRONT = 1.05
+_PER_CELL = 3
 # Scales of the cameras' positions, all of which are tried. Programs that write cameras and Gaussians use units that
 # differ by factors of up to 1000
 _SCALES = np.geomspace(1 / 1300, 1300, 115)
@@ -105,7 +107,8 @@ def check_cameras(
     colours themselves.
     """
     # fewer Gaussians are measured if otherwise more than max_projected points would be projected into all cameras
-    min_gaussians, max_projected = 200, 4_000_000
+    min_gaussians = 200
+    max_projected = 4_000_000
     samples = min(samples, max(min_gaussians, max_projected // len(cameras)))
     rows = np.flatnonzero(valid)
     rows = rows[:: max(1, len(rows) // samples)]
@@ -115,7 +118,8 @@ def check_cameras(
     colors = sh0_to_rgb(gaussians.sh0[rows, 0]).clip(0, 1)
     # points that lie inside a view, and points whose colours are compared
     visible, compared = np.zeros((2, len(points)), bool)
-    errors, shuffled_errors = list[np.ndarray](), list[np.ndarray]()
+    errors = list[np.ndarray]()
+    shuffled_errors = list[np.ndarray]()
     rng = np.random.default_rng(0)
     views_at_once = 1 + _SEEN_GAUSSIANS // max(1, len(points))
     for first_view in range(0, len(cameras), views_at_once):
@@ -130,14 +134,17 @@ def check_cameras(
             if foremost:
                 is_front = _find_foremost(column, row, depth[view, seen], cameras.width * cameras.height)
                 is_front &= seen < len(rows)  # the points ``hiding`` have no colours
-                seen, column, row = seen[is_front], column[is_front], row[is_front]
+                seen = seen[is_front]
+                column = column[is_front]
+                row = row[is_front]
             photo = photo_colors(images, np.full(len(seen), first_view + view), row, column)
             if (photo == photo[:1]).all():  # a view without a photo is black
                 continue
             compared[seen] = True
             errors.append(_mean_difference(colors[seen], photo))
             shuffled_errors.append(_mean_difference(colors[seen], rng.permutation(photo)))
-    share, num_compared = float(visible[: len(rows)].sum()) / max(1, len(rows)), int(compared.sum())
+    share = float(visible[: len(rows)].sum()) / max(1, len(rows))
+    num_compared = int(compared.sum())
     # the mean colour error, divided by the mean colour error of shuffled pixels, and the ratio's standard error
     ratio = error = np.nan
     min_error = 0.01  # colour error of shuffled pixels below which colours vary too little to decide
@@ -164,7 +171,8 @@ def _find_foremost(column: np.ndarray, row: np.ndarray, depth: np.ndarray, area:
     if not len(row):
         return np.zeros(0, bool)
     side = max(1, int(np.sqrt(_PER_CELL * area / len(row))))
-    column, row = column // side, row // side
+    column = column // side
+    row = row // side
     cells = row * (column.max() + 1) + column
     nearest = np.full(cells.max() + 1, np.inf)
     np.minimum.at(nearest, cells, depth)
@@ -341,9 +349,13 @@ def _solve_shift(inputs: AlignmentInput) -> list[Similarity]:
     The middle of the Gaussians is searched in the picture of the middle camera, at many depths.
     """
     max_views = 4  # views that shifts are tried on
-    first_samples, first_places = 300, 8  # number of Gaussians of the first search, and of places that it keeps
+    # number of Gaussians of the first search, and of places that it keeps
+    first_samples = 300
+    first_places = 8
     some_views = slice(None, None, -(-len(inputs.cameras) // max_views))
-    rows, cameras, images = (inputs.gaussians, inputs.valid), inputs.cameras[some_views], inputs.images[some_views]
+    rows = (inputs.gaussians, inputs.valid)
+    cameras = inputs.cameras[some_views]
+    images = inputs.images[some_views]
     to_world = invert(cameras.viewmats)
     centres, points = to_world[:, :3, 3], inputs.gaussians.means[inputs.valid].astype(np.float64)
     view = int(np.argmin(np.linalg.norm(centres - np.median(centres, 0), axis=1)))

@@ -24,7 +24,9 @@ from gsmerge.reading.alignment.layouts import TRIMS
 from gsmerge.reading.alignment.score import AlignmentInput, Correspondences, pixel_errors, pixel_limit
 from gsmerge.types import Cameras
 
-_LENGTH, _STRETCHES = 48, 96  # rows of a stretch, and places in the file at which stretches begin
+# rows of a stretch, and places in the file at which stretches begin
+_LENGTH = 48
+_STRETCHES = 96
 _SLACK = 8  # pixels by which the range of a search exceeds the possible places on each side
 _ROUNDS = 3  # times that the frame is solved for from the stretches that agree with it
 
@@ -45,7 +47,8 @@ def upright_rotation(inputs: AlignmentInput) -> Similarity | None:
     """Return the rotation by which rows were turned upright from a camera; None if no camera explains the rows."""
     means = inputs.gaussians.means[inputs.valid].astype(np.float64)
     # a first check of each rotation uses rough_rows rows, and allows deviations up to rough_tolerance
-    rough_rows, rough_tolerance = 2000, 1.0
+    rough_rows = 2000
+    rough_tolerance = 1.0
     sample = means[:: max(1, len(means) // rough_rows)]
     if not len(sample) or _measure_deviation(sample) > rough_tolerance:
         return None
@@ -91,7 +94,8 @@ def _possible_orders(count: int, cameras: Cameras) -> Iterator[tuple[np.ndarray,
 
     Each order is a pair: the pixels ``[p]`` of a photo that have rows, and the stretches of rows to search for in them.
     """
-    grid, views = np.arange(cameras.width * cameras.height).reshape(cameras.height, cameras.width), len(cameras)
+    grid = np.arange(cameras.width * cameras.height).reshape(cameras.height, cameras.width)
+    views = len(cameras)
     # Rows that are sorted by line, column, layer and view, where some rows are missing. Exporters that write them cut
     # off a border
     trim = TRIMS[0]
@@ -138,7 +142,8 @@ def _match_stretches(
     found = []
     no_place = 1e9  # cost of a stretch that cannot be in its photo
     for stretch, stretch_rows in zip(stretches, rows, strict=True):
-        low, high = max(0, stretch.low), min(len(pixels), stretch.high + _LENGTH)
+        low = max(0, stretch.low)
+        high = min(len(pixels), stretch.high + _LENGTH)
         if high - low < _LENGTH:
             found.append((0, no_place, 0.0))
             continue
@@ -178,7 +183,9 @@ def _solve_agreed_frame(
     views = np.array([pairs.views[parts == stretch][0] for stretch in stretches])
     # at least min_views views need min_stretches stretches that agree, and the share min_agreeing of all stretches must
     # agree
-    min_views, min_stretches, min_agreeing = 2, 3, 0.25
+    min_views = 2
+    min_stretches = 3
+    min_agreeing = 0.25
     if len(np.unique(views)) < min_views:
         return None
     limit, rng = pixel_limit(inputs.cameras.width, inputs.cameras.height), np.random.default_rng(0)

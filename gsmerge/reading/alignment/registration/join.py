@@ -82,7 +82,8 @@ def _check_joinable(scenes: Sequence[Scene], paths: Sequence[Path]) -> None:
             problem = f"expected cameras and one Gaussian for each of their pixels, as scenes to join, found {actual}"
             raise SceneError(path, problem, "compact it by itself")
         if scene_size != size:
-            expected, actual = f"{size[0]} x {size[1]} as in {paths[0].name}", f"{scene_size[0]} x {scene_size[1]}"
+            expected = f"{size[0]} x {size[1]} as in {paths[0].name}"
+            actual = f"{scene_size[0]} x {scene_size[1]}"
             raise SceneError(path, f"expected views of {expected}, found {actual}", "export all at one size")
         if sh_degree != degree:
             problem = f"expected harmonics of degree {degree} as in {paths[0].name}, found {sh_degree}"
@@ -93,7 +94,8 @@ def move_scene(scene: Scene, similarity: Similarity) -> Scene:
     """Return a scene with its Gaussians and cameras moved by a similarity, and with the same photos."""
     if similarity.scale == 1 and np.array_equal(similarity.rotation, np.eye(3)) and not similarity.shift.any():
         return scene
-    gaussians, cameras = similarity.move_gaussians(scene.gaussians), similarity.move_cameras(scene.cameras)
+    gaussians = similarity.move_gaussians(scene.gaussians)
+    cameras = similarity.move_cameras(scene.cameras)
     return replace(scene, gaussians=gaussians, cameras=cameras)
 
 
@@ -131,14 +133,18 @@ def concat_scenes(scenes: Sequence[Scene], photos: np.ndarray | None = None) -> 
 
 def _concat_pixels(scenes: Sequence[Scene]) -> Pixels | None:
     """Concatenate the pixels of scenes; None if the views of any scene share Gaussians."""
-    homes, fronts, num_rows, num_views = list[np.ndarray](), list[np.ndarray](), 0, 0
+    homes = list[np.ndarray]()
+    fronts = list[np.ndarray]()
+    num_rows = 0
+    num_views = 0
     for scene in scenes:
         if not scene.has_own_pixels:
             return None
         pixels = scene.get_pixels()
         homes.append(np.where(pixels.homes >= 0, pixels.homes + num_views * scene.pixels_per_view, -1))
         fronts.append(np.where(pixels.shown, pixels.fronts + np.int32(num_rows), np.int32(-1)))
-        num_rows, num_views = num_rows + len(scene.gaussians), num_views + len(scene)
+        num_rows = num_rows + len(scene.gaussians)
+        num_views = num_views + len(scene)
     return Pixels(np.concatenate(homes), np.concatenate(fronts), own=True)
 
 

@@ -62,7 +62,8 @@ class KeypointMatches:
 
 def find_keypoints(scene: Scene) -> list[PhotoKeypoints]:
     """Find the keypoints in the photo of every view of a scene with pixels, except keypoints at edges of surfaces."""
-    cameras, photos = scene.cameras.numpy(), []
+    cameras = scene.cameras.numpy()
+    photos = []
     for view in range(len(scene)):
         K = cameras.Ks[view].astype(np.float64)
         viewmat = cameras.viewmats[view].astype(np.float64)

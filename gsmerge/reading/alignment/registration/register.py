@@ -64,7 +64,8 @@ def register(scenes: Sequence[Scene]) -> Registration:
     Scenes are connected if enough keypoints of their photos match. If scenes form several connected sets, the largest
     set is used. All scenes have pixels, and grids of one size.
     """
-    count, cameras = len(scenes), scenes[0].cameras
+    count = len(scenes)
+    cameras = scenes[0].cameras
     photos = [find_keypoints(scene) for scene in scenes]
     size = cameras.width, cameras.height
     id_pairs = combinations(range(count), 2)
