@@ -69,7 +69,8 @@ def build_networks(path: Path, options: Mapping[str, Any], arrays: Mapping[str, 
         raise SceneError(path, f"expected the tensors of its networks, found {difference}: {name}", REMEDY)
     for name, array in arrays.items():
         if array.shape != expected[name] or array.dtype != np.float32:
-            have, want = list(array.shape), list(expected[name])
+            have = list(array.shape)
+            want = list(expected[name])
             raise SceneError(path, f"{name}: expected float32 {want}, found {array.dtype} {have}", REMEDY)
         if not np.isfinite(array).all():
             raise SceneError(path, f"{name}: expected finite numbers, found NaN or infinity", REMEDY)

@@ -104,7 +104,8 @@ def read_into_frame(load: Loaded, path: Path) -> tuple[CameraFile, dict[int, int
     Shared views are views of the file that the scene also has. The second result maps their indices in the file to
     their indices in the scene. Frame and convention are found as in :func:`read_held_out`.
     """
-    stored, own_cameras = read_cameras(path), load.cameras
+    stored = read_cameras(path)
+    own_cameras = load.cameras
     conventions = [stored]  # the cameras of the file, read in each convention
     if own_cameras is not None and own_cameras.source == stored.source and own_cameras.convention != stored.convention:
         conventions.insert(0, with_convention(stored, own_cameras.convention))
@@ -121,7 +122,8 @@ def _find_world(camera_file: CameraFile, load: Loaded) -> tuple[Similarity, dict
     names are ignored. The map is empty if names are not unique, or if no similarity brings the two poses of all shared
     views together.
     """
-    stored, names = _find_similarity(load), load.scene.names
+    stored = _find_similarity(load)
+    names = load.scene.names
     file_views, scene_views = (
         {PurePosixPath(name.replace("\\", "/")).stem: i for i, name in enumerate(view_names)}
         for view_names in (camera_file.names, names)
@@ -136,7 +138,8 @@ def _find_world(camera_file: CameraFile, load: Loaded) -> tuple[Similarity, dict
     max_angle = 0.2  # degrees by which a view's two poses may differ in one frame
     max_shift = 0.005  # largest distance between a view's two poses, relative to the extent of all views
     for frame in frames:
-        moved, centres = frame.move_viewmats(theirs), camera_centres(ours)
+        moved = frame.move_viewmats(theirs)
+        centres = camera_centres(ours)
         cosines = ((moved[:, :3, :3] * ours[:, :3, :3]).sum((1, 2)) - 1) / 2
         distance = np.linalg.norm(camera_centres(moved) - centres, axis=1).max()
         spread = float(np.linalg.norm(np.ptp(centres, axis=0), axis=0)) or 1.0
@@ -169,7 +172,8 @@ def _match_by_pose(viewmats: np.ndarray, scene: Scene) -> dict[int, int]:
     """Map views with ``viewmats [t,4,4]`` in the scene's frame to views of the scene with the same pose, by index."""
     if len(scene) == 0 or len(scene.gaussians) == 0:
         return {}
-    ours, middle = scene.cameras.viewmats, np.median(scene.gaussians.means, 0)
+    ours = scene.cameras.viewmats
+    middle = np.median(scene.gaussians.means, 0)
     # Equal poses differ by at most this in the elements of rotations, and in the centres as a share of the distance
     # from the scene. Shifts are not compared with distances between views, because there may be a single view
     same_pose = 1e-4

@@ -56,7 +56,9 @@ def read_input(
         raise SceneError(changed[0], "changed while it was read", "run this again when the file is complete")
     release_memory()
     # columns that the result will lack
-    scene, comments, notes = loaded.scene, loaded.info.comments, [*loaded.notes]
+    scene = loaded.scene
+    comments = loaded.info.comments
+    notes = [*loaded.notes]
     told = {name for note in split_notes(loaded.info.adapted, "columns")[0] for name in note.names}
     lost = [name for name in loaded.info.extra_columns if name not in told]
     if lost:
@@ -76,7 +78,8 @@ def read_input(
 
 def check_scene(scene: Scene) -> None:
     """Raise SceneError if values have another convention than gsmerge's, as in scenes that callers may make."""
-    gaussians, cameras = vars(scene.gaussians), scene.cameras
+    gaussians = vars(scene.gaussians)
+    cameras = scene.cameras
     arrays = {**gaussians, "viewmats": cameras.viewmats, "Ks": cameras.Ks, "images": scene.images}
     for name, values in arrays.items():
         if values is not None:
@@ -87,18 +90,21 @@ def check_scene(scene: Scene) -> None:
 
 def check_values(columns: Mapping[str, Array]) -> None:
     """Raise SceneError if scales are logarithms or opacities are logits. Rows that are not finite are ignored."""
-    scales, opacities = as_array(columns["scales"]), as_array(columns["opacities"])
+    scales = as_array(columns["scales"])
+    opacities = as_array(columns["opacities"])
     if len(scales) == 0 or (_lie_within(scales, 0, np.inf) and _lie_within(opacities, 0, 1)):
         return
     finite = np.isfinite(scales).all(1) & np.isfinite(opacities)
     if not finite.any():
         return
-    scales, opacities = scales[finite], opacities[finite]
+    scales = scales[finite]
+    opacities = opacities[finite]
     negative = float((scales < 0).any(1).mean())
     if negative > 0:
         problem = f"expected standard deviations of at least 0, found negative ones in {100 * negative:.3g} % of rows"
         raise SceneError("scales", problem, "they look like log scales: pass scales.exp()")
-    low, high = float(opacities.min()), float(opacities.max())
+    low = float(opacities.min())
+    high = float(opacities.max())
     if low < -TOLERANCE or high > 1 + TOLERANCE:
         problem = f"expected opacities in [0, 1], found {low:.3g} to {high:.3g}"
         raise SceneError("opacities", problem, "they look like logits: pass torch.sigmoid(opacities)")

@@ -47,7 +47,8 @@ def read_larger_and_masks(
     ``files`` are those of the scene, and ``cameras`` the scene's cameras. Returns the larger photos (None if there are
     none), the masks, and notes.
     """
-    photos, camera_file = source.photos, source.camera_file
+    photos = source.photos
+    camera_file = source.camera_file
     stored = photos.file_size or photo_size(photos.pictures)
     if stored is None or source.size is None:
         return None, NO_MASKS, []
@@ -55,7 +56,8 @@ def read_larger_and_masks(
     to_grid = source.transform or resize_to(source.size, source.size)
     # from pixels of the file to a grid
     scale = np.array([to_grid.scale_x, to_grid.scale_y]) * source.size / np.array(stored)
-    corner, grid_size = np.array([to_grid.left, to_grid.top]), np.array([to_grid.width, to_grid.height])
+    corner = np.array([to_grid.left, to_grid.top])
+    grid_size = np.array([to_grid.width, to_grid.height])
     reduction = np.array([cameras.width, cameras.height]) / grid_size  # views of unaligned scenes may be reduced again
     start = np.floor(corner / scale).astype(int)
     stop = np.minimum(np.ceil((corner + grid_size) / scale - _EDGE_ROUNDING).astype(int), stored)
@@ -73,7 +75,8 @@ def read_larger_and_masks(
         """Return the larger photo of a view."""
         if not photos.paths:
             return cut(view, photos.pictures[view])
-        path, turn = photos.paths[view], photos.turns[view]
+        path = photos.paths[view]
+        turn = photos.turns[view]
         return cut(view, decode_photos([path], [turn], stored, photos.fit.part, canvas=photos.canvas)[0])
 
     large = None
@@ -114,7 +117,8 @@ def limit_view_size(cameras: Cameras, images: np.ndarray, max_side: int) -> tupl
     """
     transform, notes = _choose_reduction((cameras.width, cameras.height), max_side)
     if transform is not None:
-        cameras, smaller = transform.cameras(cameras), transform.photos(images)
+        cameras = transform.cameras(cameras)
+        smaller = transform.photos(images)
         images = np.array([smaller[view] for view in range(len(smaller))], images.dtype).reshape(
             -1, cameras.height, cameras.width, 3
         )

@@ -154,7 +154,8 @@ class SceneFiles:
             words = shlex.join(word for option, path in self.above for word in (f"--{option}", str(path)))
             notes.append(f"{kinds} outside the scene's folder are not read; to read them, pass {words}")
         if self.below and self.cameras not in self.others:
-            paths, option = list_some([*map(str, self.others)]), shlex.join(["--cameras", str(self.others[0])])
+            paths = list_some([*map(str, self.others)])
+            option = shlex.join(["--cameras", str(self.others[0])])
             reason = "since several folders have some" if self.is_spread else "since no photo shows that they fit"
             notes.append(f"cameras in folders below are not read, {reason}: {paths}; to read them, pass {option}")
         return tuple(notes)
@@ -196,7 +197,8 @@ def find_scene_files(
         SceneError: If there is no ``.ply``, if there are several scenes to choose from, or if a named file does not
             exist. Numbered files of views or parts are one scene, see ``docs/reference/formats.md``.
     """
-    path, given = Path(path), {"cameras": cameras, "images": images, "masks": masks}
+    path = Path(path)
+    given = {"cameras": cameras, "images": images, "masks": masks}
     if images is not None and images != NONE:
         check_photo_folder(Path(images))
     named = frozenset(name for name, value in {**given, "protect": protect}.items() if value is not None)
@@ -210,7 +212,8 @@ def find_scene_files(
         views_file = path if cameras is None and _holds_views(path) else None
         photos = image_path or (views_file if images is None else None)
         return SceneFiles(path, camera_path or views_file, photos, mask_path, protect, named=named)
-    plys, num_copies = [path], 0
+    plys = [path]
+    num_copies = 0
     if os.path.isdir(path):
         plys = find_plys(path, camera_path)
         num_copies = len(list_plys(path)) - len(plys)
@@ -221,7 +224,8 @@ def find_scene_files(
             _check_scene_file(part)
     own_roots, shared = _search_roots(path, ply, within)
     roots = [*own_roots, *shared]
-    others, below = list[Path](), False
+    others = list[Path]()
+    below = False
     if cameras is None:
         camera_path, others, below = _find_camera_paths(ply, roots)
     if images is None:
@@ -470,7 +474,9 @@ def _walk_down(folder: Path, *, links: bool) -> list[tuple[Path, list[str] | Non
     With ``links``, links to folders are followed, and folders with too many entries are left out. Without ``links``,
     the list is empty if there are too many entries.
     """
-    folders, places, num_entries = list[tuple[Path, list[str] | None]](), [(folder, 0)], 0
+    folders = list[tuple[Path, list[str] | None]]()
+    places = [(folder, 0)]
+    num_entries = 0
     max_depth = 3  # most levels of folders that are searched below a folder without a scene
     for place, depth in places:  # the loop appends to this list
         with suppress(OSError), os.scandir(place) as scan:
@@ -505,7 +511,8 @@ def _order_parts(folder: Path, plys: Sequence[Path], cameras: Path | None) -> li
     if re.split(r"[-_. ]", stems.pop())[-1] in _PARTS:
         missing = next((low + 1 for low, high in pairwise(numbers) if high > low + 1), None)
         if missing is not None:
-            first, last = path_of[numbers[0]].name, path_of[numbers[-1]].name
+            first = path_of[numbers[0]].name
+            last = path_of[numbers[-1]].name
             problem = f"expected all parts from {first} to {last}, found no part with the number {missing}"
             raise SceneError(folder, problem, "add the missing part, or name one of the files")
     elif plys[0].parent.name == SCENES_PLACE or cameras is None or len({header_counts(path) for path in plys}) > 1:

@@ -30,7 +30,8 @@ def take_gaussians(ply: GaussianFile, result: AlignmentResult) -> tuple[Gaussian
     """
     is_visible = ply.valid & (ply.gaussians.opacities >= LEAST_OPACITY)
     taken = is_visible if is_visible.any() else ply.valid
-    grid, pixel_ids = (len(result.cameras), result.cameras.height, result.cameras.width), result.pixel_ids
+    grid = (len(result.cameras), result.cameras.height, result.cameras.width)
+    pixel_ids = result.pixel_ids
     # rows without pixels, or all pixels in order
     if pixel_ids is None or (len(pixel_ids) == prod(grid) and _counts_up(pixel_ids)):
         gaussians = ply.gaussians if taken.all() else ply.gaussians[taken]
@@ -40,7 +41,8 @@ def take_gaussians(ply: GaussianFile, result: AlignmentResult) -> tuple[Gaussian
     is_sorted = _increases(row_pixels)
     if not is_sorted:
         order = np.argsort(row_pixels, kind="stable")
-        rows, row_pixels = rows[order], row_pixels[order]
+        rows = rows[order]
+        row_pixels = row_pixels[order]
     gaussians = ply.gaussians if is_sorted and len(rows) == len(taken) else ply.gaussians[rows]
     # each row has a different pixel
     if row_pixels[0] >= 0 and (is_sorted or _increases(row_pixels)):
@@ -49,7 +51,8 @@ def take_gaussians(ply: GaussianFile, result: AlignmentResult) -> tuple[Gaussian
         return gaussians, Pixels.of_grid(has_row.reshape(grid))
     # several Gaussians share a pixel, or some have no pixel
     with_pixel = np.flatnonzero(row_pixels >= 0)
-    points, views = gaussians.means[with_pixel].astype(np.float64), row_pixels[with_pixel] // prod(grid[1:])
+    points = gaussians.means[with_pixel].astype(np.float64)
+    views = row_pixels[with_pixel] // prod(grid[1:])
     depths = camera_depths(points, result.cameras.viewmats, views)
     fronts = np.full(prod(grid), -1, np.int32)
     farthest_first = with_pixel[np.argsort(-depths, kind="stable")]
@@ -70,7 +73,9 @@ def _counts_up(ids: np.ndarray) -> bool:
 
 def confirm_colors(load: Loaded) -> Loaded:
     """Read colours as RGB instead of harmonics, or vice versa, if the file allows both and the photos fit better."""
-    old_info, units, images = load.info, load.info.open_units, load.scene.images
+    old_info = load.info
+    units = load.info.open_units
+    images = load.scene.images
     if units is None or images is None:
         return load
     was_rgb = old_info.color_units is not None  # the colours were read as RGB, and harmonics are tried here

@@ -34,7 +34,8 @@ class PartFit:
     def cut(self, photo: np.ndarray) -> np.ndarray:
         """Cut the part out of an upright photo ``[h,w,3]``, and stretch it."""
         part = cut_part(photo, self.part)
-        size, new_size = part.shape[1::-1], self.stretch(part.shape[1::-1])
+        size = part.shape[1::-1]
+        new_size = self.stretch(part.shape[1::-1])
         return part if size == new_size else resize_to(size, new_size).photos([part])[0]
 
     def stretch(self, size: Size) -> Size:
@@ -46,8 +47,10 @@ class PartFit:
 
     def describe(self, size: Size, *, bars: bool) -> str:
         """Return a note on which part of photos of a ``size`` is used; with ``bars``, only bars are cut off."""
-        photo_text, part = "{} x {}".format(*size), part_size(size, self.part)
-        part_text, ratio = "{} x {}".format(*part), self.stretch(part)[0] * part[1] / (part[0] * self.stretch(part)[1])
+        photo_text = "{} x {}".format(*size)
+        part = part_size(size, self.part)
+        part_text = "{} x {}".format(*part)
+        ratio = self.stretch(part)[0] * part[1] / (part[0] * self.stretch(part)[1])
         if bars:
             return f"bars around the photos are cut off: {photo_text} pixels become {part_text}"
         corner = f" from column {round(size[0] * self.part[0])} and line {round(size[1] * self.part[1])} on"
@@ -78,7 +81,8 @@ class GridFit:
 
         If only the photo or only the grid is portrait, the photo is turned first, and the result is turned back.
         """
-        (width, height), (left, top) = self.size, self.trim
+        width, height = self.size
+        left, top = self.trim
         if (photo.shape[1] - photo.shape[0]) * (width - height) < 0:
             return np.rot90(self.cut(np.ascontiguousarray(np.rot90(photo))), -1)
         whole = self.transform((photo.shape[1], photo.shape[0])).photos([photo])[0]
@@ -89,10 +93,13 @@ class GridFit:
 
         The ``photo_map`` of these cameras is the transform of photos of a ``size``.
         """
-        (left, top), (width, height), Ks = self.trim, self.size, camera_file.Ks.copy()
+        left, top = self.trim
+        width, height = self.size
+        Ks = camera_file.Ks.copy()
         assert camera_file.pixel_ids is not None, "estimated cameras are those of pixels"
         Ks[:, :2, 2] += self.trim
-        widths, heights = camera_file.widths + 2 * left, camera_file.heights + 2 * top
+        widths = camera_file.widths + 2 * left
+        heights = camera_file.heights + 2 * top
         lines, x = np.divmod(camera_file.pixel_ids, width)
         views, y = np.divmod(lines, height)
         pixel_ids = (views * (height + 2 * top) + y + top) * (width + 2 * left) + x + left
@@ -133,9 +140,11 @@ def choose_fit(shown: ViewPictures, photos: Sequence[np.ndarray | None], fits: S
             for view in views
         ])  # fmt: skip
 
-    best, best_correlations = fits[0], correlate(fits[0])
+    best = fits[0]
+    best_correlations = correlate(fits[0])
     for fit in fits[1:]:
         correlations = correlate(fit)
         if stands_out(correlations - best_correlations):
-            best, best_correlations = fit, correlations
+            best = fit
+            best_correlations = correlations
     return best

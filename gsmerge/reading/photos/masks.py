@@ -72,7 +72,8 @@ class MaskFiles:
 
     def read(self, view: int) -> tuple[np.ndarray | None, np.ndarray | None]:
         """Read which pixels ``[h,w]`` of a view count, and their weights ``[h,w]``; None: all count, with weight 1."""
-        photo, counts = self.photos[view] if self.photos else None, None
+        photo = self.photos[view] if self.photos else None
+        counts = None
         importance: np.ndarray | None = None
         alpha = None if self.stored_counts is None else self.stored_counts[view]  # only of photos without files
         if photo is not None and not self.is_plain:
@@ -104,7 +105,8 @@ class MaskFiles:
         """Read the brightness of a mask, and turn it upright if it has the orientation of the photo's file."""
         photo = self.photos[view] if self.photos else None
         opaque = _read_cutout(mask)
-        whole, turns = decode_levels(mask, photo) if opaque is None else opaque * _WHITE, self.turns[view]
+        whole = decode_levels(mask, photo) if opaque is None else opaque * _WHITE
+        turns = self.turns[view]
         if photo is not None:
             size = image_size(photo)
             if turns % 2 and same_shape(size, whole.shape[1::-1]):
@@ -113,7 +115,8 @@ class MaskFiles:
             if same_shape(upright, whole.shape[1::-1]):
                 whole = cut_part(extend_picture(whole, self.canvas, upright), self.part)
         if not same_shape(self.stored, whole.shape[1::-1]):
-            (width, height), (columns, lines) = self.stored, whole.shape[1::-1]
+            width, height = self.stored
+            columns, lines = whole.shape[1::-1]
             problem = (
                 f"expected a mask with the aspect ratio of its photo, {width} x {height}, found {columns} x {lines}"
             )
@@ -146,9 +149,12 @@ def read_masks(
     paths = photos.paths
     views = [view for view in range(len(camera_file)) if not paths or paths[view] is not None]  # with a photo
     names = [path.as_posix() for path in paths if path is not None] or list(camera_file.names)
-    of_cameras, notes = list[Path | None](), list[str]()  # the mask of each view that the camera file names
+    # the mask of each view that the camera file names
+    of_cameras = list[Path | None]()
+    notes = list[str]()
     if "masks" not in files.named:
-        path, listed = Path(camera_file.path), [camera_file.masks.get(image, "") for image in camera_file.names]
+        path = Path(camera_file.path)
+        listed = [camera_file.masks.get(image, "") for image in camera_file.names]
         of_cameras = [find_image(path.parent, name, path, option="--masks") if name else None for name in listed]
         missing = [name for name, mask in zip(listed, of_cameras, strict=True) if name and mask is None]
         if missing:
@@ -170,9 +176,12 @@ def read_masks(
         of_views = dict(zip(views, pictures, strict=True))
         return [of_views.get(view) for view in range(len(camera_file))]
 
-    masks, protecting = list_by_view(photo_masks), list_by_view(photo_protecting)
+    masks = list_by_view(photo_masks)
+    protecting = list_by_view(photo_protecting)
     turns = photos.turns or (0,) * len(masks)
-    part, canvas, stored_counts = photos.fit.part, photos.canvas, None if paths or is_plain else camera_file.counts
+    part = photos.fit.part
+    canvas = photos.canvas
+    stored_counts = None if paths or is_plain else camera_file.counts
     mask_files = MaskFiles(
         tuple(paths), turns, masks, protecting, part, canvas, stored, cut, cameras, stored_counts, is_plain
     )
@@ -219,8 +228,10 @@ def _doubt_mask(mask: Path, photos: PhotoArrays, view: int) -> float:
     if spread.mean() > 1:
         colors = picture[spread >= spread.max() / 2]
         return np.inf if np.median(np.abs(colors - np.median(colors, 0)).max(1)) > 1 else 0
-    grey, middle = picture[..., 0], (picture.min() + picture.max()) / 2
-    black, white = np.median(grey[grey <= middle]), np.median(grey[grey >= middle])
+    grey = picture[..., 0]
+    middle = (picture.min() + picture.max()) / 2
+    black = np.median(grey[grey <= middle])
+    white = np.median(grey[grey >= middle])
     if np.median(np.abs(grey - np.where(grey > middle, white, black))) <= 1:
         return 0
     photo = photos[view]

@@ -142,7 +142,8 @@ def find_photos(files: SceneFiles, camera_file: CameraFile) -> ScenePhotos:
     elif files.images is None:  # the user wants no photos
         return NO_PHOTOS
     elif files.images.is_dir():
-        folder, pool = files.images, list_images(files.images)
+        folder = files.images
+        pool = list_images(files.images)
         named = propose_images(folder, pool, names, count_pixels)
     else:
         same_file = files.cameras is not None and os.path.realpath(files.cameras) == os.path.realpath(files.images)
@@ -184,7 +185,8 @@ def _find_photos_near(files: SceneFiles, camera_file: CameraFile) -> tuple[Path,
 
     Returns the folder of the photos, all files, and for each camera the file of its name, or None.
     """
-    path, names = Path(camera_file.path), camera_file.names
+    path = Path(camera_file.path)
+    names = camera_file.names
     folder = capture_folder(path)
     named = [find_image(folder, name, path, option=files.photo_option) for name in names]
     pool = list(dict.fromkeys(path for path in named if path is not None))
@@ -236,9 +238,11 @@ def find_named_photos(
         first = next(filter(count_pixels, filter(None, proposed)), None)
         if first is None or is_drawn(first):
             return 0, folder
-        camera_size, size = sizes[proposed.index(first)], image_size(first)
+        camera_size = sizes[proposed.index(first)]
+        size = image_size(first)
         has_other_shape = min(camera_size) > 1 and not same_shape(camera_size, size)
-        count, num_exact = len({*proposed} - {None}), sum(path.name in file_names for path in filter(None, proposed))
+        count = len({*proposed} - {None})
+        num_exact = sum(path.name in file_names for path in filter(None, proposed))
         look = is_grey(first), size != camera_size, has_other_shape, -count_pixels(first)
         depth = len(pools[folder]), -len(folder.parts), folder  # prefers the innermost of folders with the same photos
         return -count, -num_exact, not folder.is_relative_to(roots[0]), *look, *depth
@@ -265,7 +269,8 @@ def count_pixels(path: Path) -> int:
 
 def _describe_missing_file(folder: Path, name: str) -> str:
     """Say that a file does not exist; also name a file of the same stem whose format is not read, if there is one."""
-    inner, same_stem = PurePath(name), set[str]()
+    inner = PurePath(name)
+    same_stem = set[str]()
     for place in {folder, folder if inner.is_absolute() or ".." in inner.parts else folder / inner.parent}:
         with suppress(OSError, ValueError):
             same_stem |= {file for file in os.listdir(place) if PurePath(file).stem == inner.stem}
@@ -320,7 +325,8 @@ def read_photos(photos: ScenePhotos, camera_file: CameraFile) -> ScenePhotos:
             problem = f"expected photos with one aspect ratio, found {width} x {height} and {size[0]} x {size[1]}"
             raise SceneError(photos.folder, problem)
     damaged = dict[Path, str]()
-    part, canvas = photos.fit.part, photos.canvas
+    part = photos.fit.part
+    canvas = photos.canvas
     pictures = decode_photos(photos.paths, photos.turns, photos.fit.stretch(size), part, damaged, canvas)
     return replace(photos, pictures=pictures, damaged=damaged)
 
@@ -372,7 +378,8 @@ def keep_one_shape(camera_file: CameraFile, photos: ScenePhotos) -> tuple[Camera
     unused = [camera_file.names[view] for view in range(len(camera_sizes)) if view not in used]
     if not unused:
         return camera_file, photos, []
-    named, faults = tuple(photos.named[view] for view in used), tuple(photos.faults[view] for view in used)
+    named = tuple(photos.named[view] for view in used)
+    faults = tuple(photos.faults[view] for view in used)
     photos = replace(photos, named=named, paths=named, turns=(0,) * len(used), faults=faults)
     doubt = f"{len(unused)} of {len(camera_sizes)} views are left out, since they do not have {shape}"
     return select_views(camera_file, used), photos, [Doubt(f"{doubt}: {list_some(unused)}")]
@@ -407,7 +414,8 @@ def assign_to_views(scene: Scene, photos: ScenePhotos, camera_file: CameraFile, 
     if camera_file.source == ESTIMATED and scene.pixels is not None:
         guessed = np.flatnonzero(~scene.pixels.shown.any((1, 2))).tolist()
     candidates = stored = _list_candidates(photos)
-    ids, images = {path: number for number, path in enumerate(photos.pool)}, scene.images
+    ids = {path: number for number, path in enumerate(photos.pool)}
+    images = scene.images
     named = [None if path is None else ids[path] for path in photos.named]
     if read and images is not None:
         view_of_photo = {photo: view for view, photo in enumerate(named) if photo is not None}
@@ -427,7 +435,8 @@ def assign_to_views(scene: Scene, photos: ScenePhotos, camera_file: CameraFile, 
     assigned, explain_most = assign_photos(show, candidates, named, exact=photos.exact, stored=stored)
     faults = list(photos.faults)
     for view in guessed:
-        path, assigned[view] = photos.named[view], None
+        path = photos.named[view]
+        assigned[view] = None
         name = f"view {view}" if path is None else _short_path(path, photos)
         faults[view] = f"{name}: its camera is unknown, since no Gaussian belongs to it"
     paths = tuple(None if assignment is None else photos.pool[assignment.photo] for assignment in assigned)
@@ -438,7 +447,8 @@ def assign_to_views(scene: Scene, photos: ScenePhotos, camera_file: CameraFile, 
 def _fit_to_grid(scene: Scene, photos: ScenePhotos) -> GridFit:
     """Find how the photos that show a scene's views were resized and cropped to the grid of its rows."""
     fits = list_fits((scene.cameras.width, scene.cameras.height))
-    shown, chosen = show_views(scene, OFFSET_PIXELS), list[np.ndarray | None]()
+    shown = show_views(scene, OFFSET_PIXELS)
+    chosen = list[np.ndarray | None]()
     assigner = Assigner(partial(show_views, scene), _list_candidates(photos))
     for view, likely in assigner.list_likely(range(len(scene)), range(len(photos.pool))).items():
         pictures = [turn_picture(assigner.candidates.read(photo), turn) for photo, turn in likely]
@@ -452,7 +462,8 @@ def has_other_shape(photos: ScenePhotos, camera_file: CameraFile) -> bool:
 
     Another aspect ratio is expected if the cameras' source is known to resize or crop photos; the result is False then.
     """
-    first, shapes = next(filter(None, photos.named), None), sizes_of(camera_file)
+    first = next(filter(None, photos.named), None)
+    shapes = sizes_of(camera_file)
     is_known = camera_file.photo_map is not None or camera_file.source in (FFGS, SHARP) or photos.canvas is not None
     if first is None or not shapes or is_known:
         return False
@@ -471,7 +482,8 @@ def name_by_photos(camera_file: CameraFile, photos: ScenePhotos) -> CameraFile:
         name if path is None else _short_path(path, photos)
         for name, path in zip(camera_file.names, photos.paths, strict=True)
     ]
-    named, size = replace(camera_file, names=tuple(names)), photos.file_size
+    named = replace(camera_file, names=tuple(names))
+    size = photos.file_size
     return named if photos.grid_fit is None or size is None else photos.grid_fit.cameras(named, size)
 
 
@@ -492,7 +504,8 @@ def describe_assignment(photos: ScenePhotos, camera_file: CameraFile, *, are_pix
     used = [(view, path) for view, path in enumerate(photos.paths) if path is not None]
     folders = dict.fromkeys(str(path.parent) for _, path in used)
     place = f"photos are read from {list_some([*folders])}, whose files have the names of the cameras"
-    count, notes = len(photos.paths), [place] if photos.by_names else []
+    count = len(photos.paths)
+    notes = [place] if photos.by_names else []
     turned = [_short_path(path, photos) for view, path in used if photos.turns[view] != orientation_turn(path)]
     if turned:
         text = f"{len(turned)} of {count} photos are turned or mirrored relative to their orientation tags"
@@ -513,7 +526,8 @@ def describe_assignment(photos: ScenePhotos, camera_file: CameraFile, *, are_pix
         notes.append(f"{text} and {'is' if len(spare) == 1 else 'are'} not used: {names}")
     reasons = list[str]()
     for view in photos.absent:
-        path, name = photos.named[view], camera_file.names[view]
+        path = photos.named[view]
+        name = camera_file.names[view]
         shown = f"{name}: no photo shows this view"
         if path is not None:
             shown = f"{_short_path(path, photos)}: shows something else than its camera"
@@ -536,7 +550,8 @@ def describe_missing(names: Sequence[str], stored: CameraFile | None, *, is_righ
     """
     if stored is None:
         return None
-    known, count = {PurePath(name).stem for name in stored.names}, len(names) - len(stored)
+    known = {PurePath(name).stem for name in stored.names}
+    count = len(names) - len(stored)
     lacking = [name for name in names if PurePath(name).stem not in known]
     are_named = len(lacking) == count > 0
     if not (are_named or is_right):
@@ -564,7 +579,8 @@ def without_photo(scene: Scene, views: Sequence[int]) -> Scene:
     """Return a scene with pictures of its Gaussians in place of the photos of ``views``; their pixels do not count."""
     if scene.images is None:
         return scene
-    images, ids = scene.images.copy(), list(views)
+    images = scene.images.copy()
+    ids = list(views)
     shape = len(scene), scene.cameras.height, scene.cameras.width
     masks = np.ones(shape, bool) if scene.masks is None else scene.masks.copy()
     masks[ids] = False
