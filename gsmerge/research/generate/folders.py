@@ -127,7 +127,8 @@ def is_complete(folder: Path, facts: Mapping[str, Any]) -> bool:
 
 def _write_views(add: AddOutput, folder: Path, cameras: Cameras, images: Sequence[Float]) -> None:
     """Write photos to ``images/``, and their cameras to ``transforms.json`` (nerfstudio: camera to world, OpenGL)."""
-    frames, digits = [], max(3, len(str(len(images) - 1)))
+    frames = []
+    digits = max(3, len(str(len(images) - 1)))
     for i, image in enumerate(images):
         name = f"images/view_{i:0{digits}d}.png"
         _, data = cv2.imencode(".png", np.round(image[..., ::-1] * 255).astype(np.uint8))

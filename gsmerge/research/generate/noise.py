@@ -91,7 +91,8 @@ def draw_noise(options: NoiseOptions, rng: np.random.Generator, factor: float = 
         drawn[name] = min(drawn[name], 1.0)
     degree = int(options.sh_degrees[rng.integers(len(options.sh_degrees))])
     if rng.random() < options.constant_opacity:
-        drawn["opacity_low"], drawn["opacity_grain"] = drawn["opacity_high"], 0.0
+        drawn["opacity_low"] = drawn["opacity_high"]
+        drawn["opacity_grain"] = 0.0
     return Noise(**drawn, sh_degree=degree)
 
 
@@ -143,7 +144,8 @@ def predict_depth(view: TrueView, noise: Noise, rng: np.random.Generator) -> tup
     """
     height, width = view.depth.shape
     far = noise.far * float(np.median(view.depth))
-    depth, is_beyond = np.minimum(view.depth, far), view.depth > far
+    depth = np.minimum(view.depth, far)
+    is_beyond = view.depth > far
     blank = 1 - texture_mask(view.image)
     edge = edge_mask(depth)
     near_edge = cv2.dilate(edge, np.ones((3, 3), np.uint8))
@@ -197,11 +199,13 @@ def pixel_gaussians(view: TrueView, lens: Pinhole, noise: Noise, rng: np.random.
     colors = np.clip(image.reshape(-1, 3) + rng.normal(0, noise.color_grain, (n, 3)), 0, 1).astype(np.float32)
     # Higher harmonics are random. Their effect is rendered at the colour RAISED, and subtracted from sh0, so that
     # Gaussians have the colours of the picture seen from its camera
-    sh0, num_rest = ((colors - 0.5) / SH_C0)[:, None].astype(np.float32), (noise.sh_degree + 1) ** 2 - 1
+    sh0 = ((colors - 0.5) / SH_C0)[:, None].astype(np.float32)
+    num_rest = (noise.sh_degree + 1) ** 2 - 1
     common = rng.normal(0, 1, (1, num_rest, 3))  # equal for all Gaussians, since highlights of a view are on one side
     shN = (noise.harmonics * (0.7 * common + 0.7 * rng.normal(0, 1, (n, num_rest, 3)))).astype(np.float32)
     if num_rest:
-        raised, eye = np.full_like(sh0, RAISED / SH_C0), view.c2w[:3, 3].astype(np.float32)
+        raised = np.full_like(sh0, RAISED / SH_C0)
+        eye = view.c2w[:3, 3].astype(np.float32)
         rendered = np.empty((n, 3), np.float32)
         view_colors(means, raised, shN, np.arange(n, dtype=np.int32), eye, 0, n, rendered)
         sh0 -= ((rendered - (RAISED + 0.5)) / SH_C0)[:, None]

@@ -32,14 +32,16 @@ Shapes = list[Shape]
 
 def build_table(pal: Palette, width: float, depth: float, height: float) -> Shapes:
     """Build a table with four legs, or a round table with one."""
-    rng, top = pal.rng, pal.material("wood", "wood", "plain", "plain", "marble", "granite", repeat=0.8)
+    rng = pal.rng
+    top = pal.material("wood", "wood", "plain", "plain", "marble", "granite", repeat=0.8)
     legs = pal.material("wood", "plain")
     thick = rng.uniform(0.02, 0.06)
     if rng.random() < 0.35:
         disc = column((0, -height + thick, 0), thick, width / 2, top)
         return [disc, rod((0, 0, 0), (0, thick - height, 0), 0.04, legs), column((0, 0, 0), 0.03, width / 4, legs)]
     out = [box((-width / 2, -height, -depth / 2), (width / 2, thick - height, depth / 2), top)]
-    inset, radius = rng.uniform(0.05, 0.12), rng.uniform(0.012, 0.04)
+    inset = rng.uniform(0.05, 0.12)
+    radius = rng.uniform(0.012, 0.04)
     for x in (inset - width / 2, width / 2 - inset):
         out += [
             rod((x * 1.02, 0, z), (x, thick - height, z), radius, legs) for z in (inset - depth / 2, depth / 2 - inset)
@@ -49,9 +51,13 @@ def build_table(pal: Palette, width: float, depth: float, height: float) -> Shap
 
 def build_chair(pal: Palette) -> Shapes:
     """Build a chair with a slatted or closed back."""
-    rng, seat, wood = pal.rng, pal.material("cloth", "wood", "plain"), pal.material("wood", "plain")
+    rng = pal.rng
+    seat = pal.material("cloth", "wood", "plain")
+    wood = pal.material("wood", "plain")
     # Width and height of the seat, and height of the back
-    w, h, back = rng.uniform(0.38, 0.5), rng.uniform(0.42, 0.5), rng.uniform(0.8, 1.05)
+    w = rng.uniform(0.38, 0.5)
+    h = rng.uniform(0.42, 0.5)
+    back = rng.uniform(0.8, 1.05)
     out = [box((-w / 2, -h, -w / 2), (w / 2, 0.05 - h, w / 2), seat)]
     for x in (-w / 2 + 0.02, w / 2 - 0.02):
         out += [rod((x, 0, 0.02 - w / 2), (x, -h, 0.02 - w / 2), 0.016, wood)]
@@ -65,7 +71,9 @@ def build_chair(pal: Palette) -> Shapes:
 
 def build_shelf(pal: Palette, width: float, height: float) -> Shapes:
     """Build a shelf with books and small objects. The back is at z = 0."""
-    rng, board, depth = pal.rng, pal.material("wood", "plain", "plaster", repeat=0.7), 0.3
+    rng = pal.rng
+    board = pal.material("wood", "plain", "plaster", repeat=0.7)
+    depth = 0.3
     out = [box((x - 0.012, -height, -depth), (x + 0.012, 0, 0), board) for x in (-width / 2, width / 2)]
     out.append(box((-width / 2, -height, -0.01), (width / 2, 0, 0), board))
     for y in np.arange(0.05, height, rng.uniform(0.28, 0.42)):
@@ -73,10 +81,12 @@ def build_shelf(pal: Palette, width: float, height: float) -> Shapes:
         if y + 0.3 > height:
             break
         if rng.random() < 0.7:
-            left, right = -width / 2, width / 2
+            left = -width / 2
+            right = width / 2
             if rng.random() < 0.5:
                 left, right = np.sort(rng.uniform(left, right, 2))
-            top, front = y + rng.uniform(0.18, 0.26), -depth * rng.uniform(0.6, 0.95)
+            top = y + rng.uniform(0.18, 0.26)
+            front = -depth * rng.uniform(0.6, 0.95)
             out.append(box((left, -top, front), (max(right, left + 0.1), -y - 0.02, -0.02), pal.material("spines")))
         else:
             for x in rng.uniform(-width / 2.3, width / 2.3, rng.integers(1, 4)):
@@ -86,7 +96,8 @@ def build_shelf(pal: Palette, width: float, height: float) -> Shapes:
 
 def build_lamp(pal: Palette, height: float) -> Shapes:
     """Build a standing lamp on a thin pole."""
-    pole, shade = pal.material("plain", gloss=0.6), pal.material("plain", "cloth")
+    pole = pal.material("plain", gloss=0.6)
+    shade = pal.material("plain", "cloth")
     radius = pal.rng.uniform(0.1, 0.2)
     out = [column((0, 0, 0), 0.02, radius, pole), rod((0, 0, 0), (0, -height, 0), pal.rng.uniform(0.006, 0.015), pole)]
     return [*out, column((0, 0.1 - height, 0), 0.25, radius * 1.3, shade, top=0.6)]
@@ -100,7 +111,9 @@ def build_carton(pal: Palette) -> Shapes:
 
 def build_can(pal: Palette) -> Shapes:
     """Build a can, a jar or a mug."""
-    rng, r, h = pal.rng, pal.rng.uniform(0.025, 0.05), pal.rng.uniform(0.07, 0.16)
+    rng = pal.rng
+    r = pal.rng.uniform(0.025, 0.05)
+    h = pal.rng.uniform(0.07, 0.16)
     wrapping = pal.material("label", "label", "plain", "marble", gloss=rng.uniform(0, 0.8))
     body = column((0, 0, 0), h, r, wrapping, top=rng.uniform(0.9, 1.15))
     return [body, column((0, -h, 0), 0.004, r * 0.85, pal.material("plain", gloss=0.8))]
@@ -108,8 +121,10 @@ def build_can(pal: Palette) -> Shapes:
 
 def build_bottle(pal: Palette) -> Shapes:
     """Build a bottle or vase with a neck."""
-    rng, glass = pal.rng, pal.material("plain", "gradient", "marble", gloss=0.9)
-    r, h = rng.uniform(0.025, 0.06), rng.uniform(0.12, 0.3)
+    rng = pal.rng
+    glass = pal.material("plain", "gradient", "marble", gloss=0.9)
+    r = rng.uniform(0.025, 0.06)
+    h = rng.uniform(0.12, 0.3)
     out = [column((0, 0, 0), 0.65 * h, r, glass), column((0, -0.65 * h, 0), 0.15 * h, r, glass, top=0.35)]
     out.append(column((0, -0.8 * h, 0), 0.2 * h, 0.35 * r, glass))
     return [*out, column((0, -0.12 * h, 0), 0.35 * h, r * 1.01, pal.material("label", "printed"))]
@@ -117,7 +132,8 @@ def build_bottle(pal: Palette) -> Shapes:
 
 def build_bowl(pal: Palette) -> Shapes:
     """Build a bowl with fruit."""
-    rng, r = pal.rng, pal.rng.uniform(0.07, 0.14)
+    rng = pal.rng
+    r = pal.rng.uniform(0.07, 0.14)
     out = [column((0, 0, 0), 0.06, r * 0.5, pal.material("plain", "cloth", gloss=0.5), top=2.0)]
     fruit = pal.material("plaster", "gradient", gloss=0.3)
     for _ in range(rng.integers(2, 7)):
@@ -128,7 +144,9 @@ def build_bowl(pal: Palette) -> Shapes:
 
 def build_toy(pal: Palette) -> Shapes:
     """Build a figure of uneven lumps."""
-    rng, skin, limbs = pal.rng, pal.material("plain", "cloth", "plaster"), pal.material("plain", "cloth", "gradient")
+    rng = pal.rng
+    skin = pal.material("plain", "cloth", "plaster")
+    limbs = pal.material("plain", "cloth", "gradient")
     h = rng.uniform(0.12, 0.3)
     out = [blob((0, -0.35 * h, 0), h * np.array([0.26, 0.36, 0.24]), skin, rng, 0.15)]
     out.append(blob((0, -0.8 * h, 0), h * np.array([0.24, 0.22, 0.22]), skin, rng, 0.12))
@@ -142,9 +160,13 @@ def build_toy(pal: Palette) -> Shapes:
 
 def build_books(pal: Palette) -> Shapes:
     """Build a pile of books."""
-    rng, y, out = pal.rng, 0.0, []
+    rng = pal.rng
+    y = 0.0
+    out = []
     for _ in range(rng.integers(1, 6)):
-        w, d, h = rng.uniform(0.12, 0.22), rng.uniform(0.1, 0.16), rng.uniform(0.01, 0.04)
+        w = rng.uniform(0.12, 0.22)
+        d = rng.uniform(0.1, 0.16)
+        h = rng.uniform(0.01, 0.04)
         book = box((-w / 2, -h, -d / 2), (w / 2, 0, d / 2), pal.material("label", "printed", "cloth", "spines"))
         out += place_shapes([book], (0, y, 0), yaw=rng.normal(0, 0.25))
         y -= h
@@ -159,7 +181,9 @@ def build_paper(pal: Palette) -> Shapes:
 
 def build_plant(pal: Palette, height: float, leaves: int) -> Shapes:
     """Build a pot with stems and leaves."""
-    rng, green, stem = pal.rng, pal.material("foliage"), pal.material("plain", "bark")
+    rng = pal.rng
+    green = pal.material("foliage")
+    stem = pal.material("plain", "bark")
     pot = 0.25 * height
     out = [column((0, 0, 0), pot, 0.16 * height, pal.material("plain", "plaster", "cloth", "marble"), top=1.3)]
     stems = [(rng.normal(0, 0.28, 3) * height + [0, -0.8 * height, 0]) for _ in range(max(2, leaves // 12))]
@@ -193,8 +217,10 @@ def build_wire(pal: Palette, start: Array, end: Array, sag: float, radius: float
 def build_window(pal: Palette, width: float, height: float) -> Shapes:
     """Build a window with frame and bars in the plane z = 0; the foot is at the origin."""
     pane = quad((0, -height / 2, -0.01), (width / 2, height / 2), pal.material("sky", "crown"))
-    frame, t = pal.material("plain", "wood"), pal.rng.uniform(0.03, 0.07)
-    w, h = width / 2, height
+    frame = pal.material("plain", "wood")
+    t = pal.rng.uniform(0.03, 0.07)
+    w = width / 2
+    h = height
     bars = [((-w - t, -h - t), (w + t, -h)), ((-w - t, 0), (w + t, t)), ((-w - t, -h), (-w, 0)), ((w, -h), (w + t, 0))]
     bars += [((-t / 3, -h), (t / 3, 0)), ((-w, -0.55 * h - t / 3), (w, -0.55 * h + t / 3))]
     return [replace(pane, shell=True, glow=True), *(box((*a, -t), (*b, 0.0), frame) for a, b in bars)]
@@ -230,7 +256,8 @@ def spread_objects(pal: Palette, count: int, half: tuple[float, float], height: 
 
     The objects do not touch. Papers and perhaps a cable lie between them.
     """
-    rng, out = pal.rng, []
+    rng = pal.rng
+    out = []
     spots: list[Array] = []
     clearance = 0.16  # least distance between the middles of small objects, metres
     for _ in range(count * 4):
@@ -256,7 +283,8 @@ def draw_lights(rng: np.random.Generator, lamp_at: Array) -> Light:
 
     The direct light comes from above and from behind the cameras.
     """
-    side, up = rng.uniform(-1.2, 1.2), rng.uniform(0.5, 1.3)
+    side = rng.uniform(-1.2, 1.2)
+    up = rng.uniform(0.5, 1.3)
     towards = np.array([sin(side), -up, -cos(side)])
     key = rng.uniform(0.8, 4.0) * (1 + (0.4 * draw_color(rng, strength=(0, 0.4), light=(0.9, 1)) - 0.4))
     ambient = rng.uniform(0.5, 1.1) * (
@@ -271,7 +299,9 @@ def _build_walls(pal: Palette, width: float, depth: float, height: float) -> Sha
     kinds = ("plain", "plain", "plain", "plaster", "bricks", "cloth", "tiles", "wood")
     papers = [pal.material(*kinds, repeat=rng.uniform(0.3, 0.8), gloss=0.0) for _ in range(2)]
     floor = pal.material("wood", "wood", "tiles", "carpet", "granite", "plaster", "plain", repeat=rng.uniform(0.3, 0.8))
-    w, d, h = width / 2, depth / 2, height
+    w = width / 2
+    d = depth / 2
+    h = height
     out = [quad((0, 0, 0), (w, d), floor, LYING), quad((0, -h, 0), (w, d), pal.material("plain", gloss=0.0), LYING)]
     out += [quad((0, -h / 2, z), (w, h / 2), papers[0]) for z in (d, -d)]
     out += [quad((x, -h / 2, 0), (d, h / 2), papers[k], FACING) for x, k in ((-w, 1), (w, rng.integers(2)))]
@@ -287,9 +317,12 @@ def _build_walls(pal: Palette, width: float, depth: float, height: float) -> Sha
 
 def _build_wall_objects(pal: Palette, half: float, height: float) -> Shapes:
     """Build pictures, windows, shelves and doors at random, side by side on the plane z = 0."""
-    rng, out, x = pal.rng, [], -half + 0.3
+    rng = pal.rng
+    out = []
+    x = -half + 0.3
     while x < half - 0.5:
-        wide, kind = rng.uniform(0.3, 1.2), ("picture", "picture", "window", "shelf", "door")[rng.integers(0, 5)]
+        wide = rng.uniform(0.3, 1.2)
+        kind = ("picture", "picture", "window", "shelf", "door")[rng.integers(0, 5)]
         at = (x + wide / 2, 0.0, 0.0)
         if kind == "picture":
             frame = build_picture(pal, wide, min(wide * rng.uniform(0.6, 1.4), 0.45 * height))
@@ -310,7 +343,10 @@ def _build_wall_objects(pal: Palette, half: float, height: float) -> Shapes:
 def build_room(pal: Palette) -> Room:
     """Build a furnished room: walls with pictures and shelves, tables, chairs, plants, lamps, cables."""
     rng = pal.rng
-    w, d, h = rng.uniform(4.0, 7.0), rng.uniform(4.5, 7.0), rng.uniform(2.3, 3.2)  # width, depth and height
+    # width, depth and height
+    w = rng.uniform(4.0, 7.0)
+    d = rng.uniform(4.5, 7.0)
+    h = rng.uniform(2.3, 3.2)
     shapes = _build_walls(pal, w, d, h)
     spots = [(x * w, z * d) for x in (-0.3, 0.0, 0.3) for z in (0.05, 0.32)]  # x and z where furniture may stand
     for i in rng.permutation(len(spots))[: rng.integers(3, 6)]:
@@ -339,12 +375,15 @@ def build_sofa(pal: Palette) -> Shapes:
 
 def _build_furniture(pal: Palette) -> Shapes:
     """Build a chair, a sofa, or a table with small objects and perhaps a chair."""
-    rng, kind = pal.rng, ("chair", "sofa", "table", "table")[pal.rng.integers(0, 4)]
+    rng = pal.rng
+    kind = ("chair", "sofa", "table", "table")[pal.rng.integers(0, 4)]
     if kind == "chair":
         return build_chair(pal)
     if kind == "sofa":
         return build_sofa(pal)
-    width, depth, height = rng.uniform(0.7, 1.5), rng.uniform(0.5, 0.9), rng.uniform(0.4, 0.8)
+    width = rng.uniform(0.7, 1.5)
+    depth = rng.uniform(0.5, 0.9)
+    height = rng.uniform(0.4, 0.8)
     top = spread_objects(pal, int(rng.integers(2, 7)), (0.3 * width, 0.3 * depth), height)
     out = build_table(pal, width, depth, height) + top
     return out + (place_shapes(build_chair(pal), (0, 0, -0.7), yaw=np.pi) if rng.random() < 0.5 else [])

@@ -22,8 +22,12 @@ from gsmerge.research.generate.textures import Texture, make_mipmaps
 
 NO_SURFACE_DEPTH = 1e6  # depth of pixels without a surface, metres
 SAMPLE_RAYS = 2  # rays per pixel and axis for colours; depth has one ray through the pixel's centre
-KEY_MAPS, KEY_SIZE = 5, 640  # number of shadow maps of the direct light, for soft shadows, and their side in pixels
-AMBIENT_MAPS, AMBIENT_SIZE = 24, 256  # number and side of the shadow maps of the light from all sides
+# number of shadow maps of the direct light, for soft shadows, and their side in pixels
+KEY_MAPS = 5
+KEY_SIZE = 640
+# number and side of the shadow maps of the light from all sides
+AMBIENT_MAPS = 24
+AMBIENT_SIZE = 256
 GLOW = 0.7  # brightness of glowing shapes, relative to a white wall in full light
 GRAZING_STRENGTH = 0.25  # strength of reflections at grazing angles, relative to the gloss
 
@@ -100,7 +104,8 @@ def screen_boxes(shapes: ShapeArrays, c2w: Array, lens: Pinhole, samples: int) -
     # Edges that reach behind the camera are cut at the near plane. The numbers of two corners of an edge differ in one
     # bit
     edges = np.array([(i, i | bit) for bit in (1, 2, 4) for i in range(8) if not i & bit])
-    a, b = local[:, edges[:, 0]], local[:, edges[:, 1]]
+    a = local[:, edges[:, 0]]
+    b = local[:, edges[:, 1]]
     near_plane = 1e-3  # metres
     with np.errstate(divide="ignore", invalid="ignore"):  # edges parallel to the plane are not used
         crossing = a + (b - a) * ((near_plane - a[..., 2:]) / (b[..., 2:] - a[..., 2:]))
@@ -118,11 +123,13 @@ def screen_boxes(shapes: ShapeArrays, c2w: Array, lens: Pinhole, samples: int) -
 
 def trace(shapes: ShapeArrays, c2w: Array, lens: Pinhole, samples: int) -> Hits:
     """Cast ``samples`` x ``samples`` rays for each pixel of the camera ``c2w [4,4]``, and return their first hits."""
-    h, w = lens.height * samples, lens.width * samples
+    h = lens.height * samples
+    w = lens.width * samples
     hits = Hits(np.full((h, w), NO_SURFACE_DEPTH), np.full((h, w), -1, np.int32), *np.zeros((2, h, w, 3), np.float32))
     intrinsics = np.array([lens.focal, lens.focal, lens.width / 2, lens.height / 2])
     c2w = np.ascontiguousarray(c2w, dtype=np.float64)
-    eye, axes = c2w[:3, 3].copy(), c2w[:3, :3].copy()
+    eye = c2w[:3, 3].copy()
+    axes = c2w[:3, :3].copy()
     table = shapes.kinds, shapes.rotations, shapes.centres, shapes.sizes, shapes.waves
     boxes = screen_boxes(shapes, c2w, lens, samples)
     # Fills the arrays of hits
@@ -147,13 +154,16 @@ def light_room(room: Room) -> LitRoom:
     # Walls and glowing shapes cast no shadow; the arrays need one shape at least
     opaque = pack_shapes([s for s in room.shapes if not s.shell and not s.glow] or room.shapes[:1])
     radii = np.linalg.norm(half_sizes(opaque), axis=1)[:, None]
-    low, high = (opaque.centres - radii).min(0), (opaque.centres + radii).max(0)
-    middle, radius = (low + high) / 2, norm(high - low) / 2
+    low = (opaque.centres - radii).min(0)
+    high = (opaque.centres + radii).max(0)
+    middle = (low + high) / 2
+    radius = norm(high - low) / 2
     rng = np.random.default_rng(0)
     key = [room.light.towards + room.light.softness * rng.normal(0, 0.6, 3) for _ in range(KEY_MAPS)]
     # The directions ``[AMBIENT_MAPS,3]`` of the ambient light, evenly over the sphere (Fibonacci's spiral)
     steps = np.arange(AMBIENT_MAPS) + 0.5
-    up, azimuth = 1 - 2 * steps / AMBIENT_MAPS, np.pi * (1 + 5**0.5) * steps
+    up = 1 - 2 * steps / AMBIENT_MAPS
+    azimuth = np.pi * (1 + 5**0.5) * steps
     horizontal = np.sqrt(1 - up**2)
     ambient = np.stack([horizontal * cos(azimuth), -up, horizontal * sin(azimuth)], 1)
     all_axes = []  # axes of each shadow map as rows right, down, forward ``[3,3]``
@@ -182,7 +192,8 @@ def texture_coordinates(shapes: ShapeArrays, ids: NDArray[np.int32], points: Flo
 
     Round surfaces are unrolled about their y axis. Flat faces are projected along their axis.
     """
-    kinds, half = shapes.kinds[ids], shapes.sizes[ids, :3].astype(np.float32)
+    kinds = shapes.kinds[ids]
+    half = shapes.sizes[ids, :3].astype(np.float32)
     x, y, z = points.T
     share_x, share_y, share_z = (np.abs(points) / np.maximum(half, 1e-9)).T  # 1 on a face across this axis
     is_round = (kinds == ELLIPSOID) | (kinds == BLOB) | ((kinds == CONE) & (share_y < 1 - 1e-5))
@@ -210,7 +221,8 @@ def look_up_colors(lit: LitRoom, ids: NDArray[np.int32], points: Float, spread: 
     """
     uv, repeat = texture_coordinates(lit.shapes, ids, points)
     textures = np.array([s.material.texture for s in lit.shapes.shapes])[ids]
-    size, num_levels = len(lit.mips[0][0]), len(lit.mips[0])
+    size = len(lit.mips[0][0])
+    num_levels = len(lit.mips[0])
     powers = np.frexp(np.maximum(spread * repeat * size, 1) * 2**0.5)[1] - 1  # nearest powers of two, in texels
     levels = np.minimum(powers, num_levels - 1)
     mip_ids = textures * num_levels + levels
@@ -243,8 +255,10 @@ def render_light(lit: LitRoom, c2w: Array, lens: Pinhole, samples: int) -> Float
 
 def _reflect(lit: LitRoom, hits: Hits, rows: NDArray[np.int64], c2w: Array, lens: Pinhole, samples: int) -> Float:
     """Compute the linear light ``[n,3]`` of the samples ``rows [n]``, which hit a shape of the room."""
-    points, normals = hits.points.reshape(-1, 3)[rows], hits.normals.reshape(-1, 3)[rows]
-    ids, depth = hits.ids.reshape(-1)[rows], hits.depth.reshape(-1)[rows]
+    points = hits.points.reshape(-1, 3)[rows]
+    normals = hits.normals.reshape(-1, 3)[rows]
+    ids = hits.ids.reshape(-1)[rows]
+    depth = hits.depth.reshape(-1)[rows]
     y, x = np.divmod(rows, hits.depth.shape[1])
     slopes = np.stack([(x + 0.5) / samples - lens.width / 2, (y + 0.5) / samples - lens.height / 2], 1) / lens.focal
     rays = rotate(np.concatenate([slopes, np.ones((len(slopes), 1))], 1), c2w[:3, :3])  # with the depth 1
@@ -263,18 +277,26 @@ def _shade(lit: LitRoom, ids: NDArray[np.int32], albedo: Float, positions: Float
 
     ``rays`` are unit vectors from the camera to the points.
     """
-    light, shapes, half_side = lit.room.light, lit.shapes.shapes, lit.radius
+    light = lit.room.light
+    shapes = lit.shapes.shapes
+    half_side = lit.radius
     # The direct and the ambient light ``[n]`` that arrives at the points, with shadows
     direct, indirect = np.zeros((2, len(positions)), np.float32)
-    key_texels, ambient_texels = 2.0, 1.2  # texels by which a lit surface may lie behind the shadow map's depth
-    key_bias, ambient_bias = key_texels * 2 * half_side / KEY_SIZE, ambient_texels * 2 * half_side / AMBIENT_SIZE
-    key_axes, ambient_axes = lit.axes[:KEY_MAPS], lit.axes[KEY_MAPS:]
+    # texels by which a lit surface may lie behind the shadow map's depth
+    key_texels = 2.0
+    ambient_texels = 1.2
+    key_bias = key_texels * 2 * half_side / KEY_SIZE
+    ambient_bias = ambient_texels * 2 * half_side / AMBIENT_SIZE
+    key_axes = lit.axes[:KEY_MAPS]
+    ambient_axes = lit.axes[KEY_MAPS:]
     equal = np.full(KEY_MAPS, 1 / KEY_MAPS)
     # Each call adds to its last argument
     add_light(positions, normals, key_axes, lit.middle, half_side, lit.key, key_bias, equal, direct)
     add_light(positions, normals, ambient_axes, lit.middle, half_side, lit.ambient, ambient_bias, lit.weights, indirect)
     lamp_distance = np.linalg.norm(positions - light.lamp.astype(np.float32), axis=1)
-    lamp_gain, lamp_falloff = 2.5, 1.5  # brightness of the direct light at the lamp, and its decrease with the distance
+    # brightness of the direct light at the lamp, and its decrease with the distance
+    lamp_gain = 2.5
+    lamp_falloff = 1.5
     direct *= lamp_gain / (1 + (lamp_distance / norm(light.lamp - lit.room.focus)) ** 2 * lamp_falloff)
     gloss = np.array([s.material.gloss for s in shapes], np.float32)[ids]
     halfway = light.towards.astype(np.float32) - rays  # between light and camera (Blinn 1977)
@@ -282,7 +304,8 @@ def _shade(lit: LitRoom, ids: NDArray[np.int32], albedo: Float, positions: Float
     shine = gloss * direct * power(np.clip((normals * halfway).sum(1), 0, 1), 8 + 120 * gloss)
     grazing = (1 + (normals * rays).sum(1)).clip(0, 1)
     rim = GRAZING_STRENGTH * gloss * (grazing * grazing) ** 2  # grazing views reflect more (Schlick 1994)
-    key, ambient = light.key.astype(np.float32), light.ambient.astype(np.float32)
+    key = light.key.astype(np.float32)
+    ambient = light.ambient.astype(np.float32)
     out = albedo * (key * direct[:, None] + ambient * indirect[:, None])
     out += shine[:, None] * key + rim[:, None] * ambient
     glow = np.array([s.glow for s in shapes])[ids]
@@ -293,7 +316,8 @@ def _shade(lit: LitRoom, ids: NDArray[np.int32], albedo: Float, positions: Float
 def find_exposure(pictures: Sequence[Float], brightness: float) -> float:
     """Find the exposure factor at which tone-mapped pictures have the mean ``brightness``, sRGB, by bisection."""
     values = np.concatenate([picture.reshape(-1) for picture in pictures])
-    low, high = 1e-3, 1e3
+    low = 1e-3
+    high = 1e3
     for _ in range(30):
         middle = (low * high) ** 0.5
         low, high = (middle, high) if tone_map(values * middle).mean() < brightness else (low, middle)

@@ -18,7 +18,9 @@ Vector: TypeAlias = Sequence[float] | Array  # of length 3
 Pair: TypeAlias = tuple[float, float]
 NUM_WAVES = 4  # number of waves that bend the surface of a shape
 NO_WAVES = np.zeros((NUM_WAVES, 5))  # waves with the amplitude 0, for a smooth surface
-TAPER, AMPLITUDE = 3, 4  # columns: the taper in a shape's size, and the amplitude in its waves
+# columns: the taper in a shape's size, and the amplitude in its waves
+TAPER = 3
+AMPLITUDE = 4
 
 
 @dataclass(frozen=True)
@@ -77,7 +79,8 @@ FACING_FRONT, LYING = np.eye(3), axis_rotation(0, np.pi / 2)  # with these rotat
 
 def box(low: Vector, high: Vector, material: Material) -> Shape:
     """Make a box between two corners."""
-    a, b = np.asarray(low, float), np.asarray(high, float)
+    a = np.asarray(low, float)
+    b = np.asarray(high, float)
     half = np.abs(b - a) / 2
     return Shape(BOX, (*half, 1.0), material, (a + b) / 2)
 
@@ -101,7 +104,8 @@ def column(foot: Vector, height: float, radius: float, material: Material, *, to
 
 def rod(start: Vector, end: Vector, radius: float, material: Material) -> Shape:
     """Make a cylinder between two points."""
-    a, b = np.asarray(start, float), np.asarray(end, float)
+    a = np.asarray(start, float)
+    b = np.asarray(end, float)
     length = norm(b - a)
     y = (b - a) / length
     x = np.cross(y, [0.0, 0.0, 1.0] if abs(y[2]) < 0.9 else [1.0, 0.0, 0.0])

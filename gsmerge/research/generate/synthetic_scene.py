@@ -54,7 +54,8 @@ def look_at(eye: Array, target: Array, roll: float = 0.0) -> Array:
     out = np.eye(4)
     out[:3, 0] = cos(roll) * right + sin(roll) * down
     out[:3, 1] = cos(roll) * down - sin(roll) * right
-    out[:3, 2], out[:3, 3] = forward, eye
+    out[:3, 2] = forward
+    out[:3, 3] = eye
     return out
 
 
@@ -71,7 +72,8 @@ def draw_path(room: Room, rng: np.random.Generator, num_views: int) -> PathFunct
 
     def pose(s: float) -> Array:
         """Return the camera-to-world matrix at a position along the path, 0 to 1."""
-        angle, radius = np.deg2rad(start + span * s), distance * (1 + growth * s)
+        angle = np.deg2rad(start + span * s)
+        radius = distance * (1 + growth * s)
         x, _, z = room.focus
         eye = np.array([x + radius * sin(angle), -(height + sway * sin(6 * s + phase)), z - radius * cos(angle)])
         return look_at(eye, room.focus, 0.03 * sin(5 * s + phase))
@@ -86,7 +88,9 @@ def is_usable(hits: Hits) -> bool:
     if depth.size < min_hits * hits.depth.size:
         return False
     nearest = np.percentile(depth, 1)
-    min_near, min_near_metres = 0.22, 0.6  # least distance of the nearest shape: in median depths, or in metres
+    # least distance of the nearest shape: in median depths, or in metres
+    min_near = 0.22
+    min_near_metres = 0.6
     return bool(nearest > min_near * np.median(depth) or nearest > min_near_metres)
 
 
@@ -141,7 +145,9 @@ class _PhotoSession:
 
     def take_photo(self, place: int, seed: int) -> Float:
         """Take the photo ``[h,w,3]`` of a place on the path, with the errors of lens and sensor."""
-        rng, lens, noise = np.random.default_rng(seed), self.photo_lens, self.noise
+        rng = np.random.default_rng(seed)
+        lens = self.photo_lens
+        noise = self.noise
         linear = render_light(self.lit, self.poses[place], lens, SAMPLE_RAYS)
         gains = self.gain * exp(noise.exposure * rng.normal() + noise.tint * rng.normal(0, 1, 3))
         y, x = np.mgrid[: lens.height, : lens.width] + 0.5
@@ -186,7 +192,8 @@ def make_synthetic_scene(seed: int, index: int, options: GenerateOptions) -> Syn
     photo_seeds = rng.integers(0, 2**63, num_places)
     # Half of the scenes have the first camera at the origin, as the files of many exporters do
     session = replace(session, to_export=invert_motion(session.poses[0]) if rng.random() < 0.5 else np.eye(4))
-    views, targets = range(0, num_places, 2), range(1, num_places, 2)
+    views = range(0, num_places, 2)
+    targets = range(1, num_places, 2)
     errors = {view: (rng.normal(0, 1, (2, 3)), int(rng.integers(2**63))) for view in views}  # deviation and seed
 
     def take_view(place: int) -> tuple[Float, Array, Gaussians | None]:
@@ -212,7 +219,8 @@ def _plan_session(rng: np.random.Generator, options: GenerateOptions) -> _PhotoS
     """Draw the errors, cameras, room, path and exposure of a scene, in the world of the room."""
     noise = draw_noise(options.ranges, rng, options.noise)
     focal = max(options.width, options.height) * rng.uniform(*FOCAL)
-    lens, scale = Pinhole(options.width, options.height, focal), options.photo_scale
+    lens = Pinhole(options.width, options.height, focal)
+    scale = options.photo_scale
     photo_lens = Pinhole(scale * lens.width, scale * lens.height, scale * lens.focal)
     lit, path = _find_room(rng, photo_lens, options.views)
     poses = [path(s) for s in np.linspace(0, 1, 2 * options.views - 1)]
@@ -232,7 +240,9 @@ def _find_room(rng: np.random.Generator, lens: Pinhole, num_views: int) -> tuple
     """Draw a room and a path on which all views are usable. After too many tries, return the last room and path."""
     power = int(1.6 * max(lens.width, lens.height)).bit_length() - 1
     side = 2 ** min(max(power, 7), 10)  # side of textures, pixels: a power of two near the photo's side
-    path_tries, room_tries = 6, 6  # most paths per room, and most rooms
+    # most paths per room, and most rooms
+    path_tries = 6
+    room_tries = 6
     for _ in range(room_tries):
         lit = light_room(build_room(Palette(rng, side)))
         for _ in range(path_tries):

@@ -37,11 +37,14 @@ def draw_octaves(
     octave along a side. ``stretch`` is the ratio of a cell's length to its height. Noise that is ``ridged`` has sharp
     crests, as in rock and bark.
     """
-    out, strength, cells = np.zeros((size, size), np.float32), 1.0, min(first, size // 2)
+    out = np.zeros((size, size), np.float32)
+    strength = 1.0
+    cells = min(first, size // 2)
     while cells <= size // 2:
         layer = enlarge_texture(rng.uniform(-1, 1, (cells, max(1, cells // stretch))), size)
         out += strength * (1 - 2 * np.abs(layer) if ridged else layer)
-        strength, cells = strength * fade, cells * 2
+        strength = strength * fade
+        cells = cells * 2
     low, high = np.percentile(out, (1, 99))
     return np.clip((out - low) / (high - low), 0, 1).astype(np.float32)
 
@@ -64,7 +67,9 @@ def draw_courses(
     x, y = pixel_places(size)
     row = np.floor(y * rows).astype(int)
     along = x * columns + offset * (row % 2)  # place along the row, in bricks
-    down, across = y * rows - row, along - np.floor(along)  # place within the brick, 0 to 1
+    # place within the brick, 0 to 1
+    down = y * rows - row
+    across = along - np.floor(along)
     tones = rng.uniform(0, 1, (rows, columns)).astype(np.float32)
     width = joint * columns / rows
     lines = np.minimum(np.minimum(down, 1 - down) / joint, np.minimum(across, 1 - across) / width)
@@ -81,13 +86,16 @@ def draw_pebbles(rng: np.random.Generator, size: int, count: int) -> tuple[Grey,
     ) / count
     tones = rng.uniform(0, 1, (count, count)).astype(np.float32)
     x, y = pixel_places(size)
-    column, row = np.floor(x * count).astype(int), np.floor(y * count).astype(int)
-    nearest, second = np.full((size, size), 9.0, np.float32), np.full((size, size), 9.0, np.float32)
+    column = np.floor(x * count).astype(int)
+    row = np.floor(y * count).astype(int)
+    nearest = np.full((size, size), 9.0, np.float32)
+    second = np.full((size, size), 9.0, np.float32)
     tone = np.zeros((size, size), np.float32)
     for i in (-1, 0, 1):
         for j in (-1, 0, 1):
             neighbour = (row + i) % count, (column + j) % count
-            dx, dy = x - points[neighbour][..., 0], y - points[neighbour][..., 1]
+            dx = x - points[neighbour][..., 0]
+            dy = y - points[neighbour][..., 1]
             distance = np.sqrt((dx - np.round(dx)) ** 2 + (dy - np.round(dy)) ** 2)
             tone = np.where(distance < nearest, tones[neighbour], tone)
             second = np.minimum(second, np.maximum(distance, nearest))
@@ -111,7 +119,9 @@ def draw_text_line(rng: np.random.Generator, alphabet: NDArray[np.uint8], height
     """Draw one line of words; return the ink ``[height,width]``, from 0 for paper to 1."""
     line = np.zeros((7, max(6, 7 * width // height)), np.uint8)
     column = 0
-    pitch, word_space = 6, 4  # pixels from letter to letter, and additional pixels between words
+    # pixels from letter to letter, and additional pixels between words
+    pitch = 6
+    word_space = 4
     while column < line.shape[1] - pitch:
         for letter in alphabet[rng.integers(0, len(alphabet), rng.integers(2, 10))]:
             if column < line.shape[1] - pitch:
@@ -133,7 +143,8 @@ def draw_color(
     Without a range of hues, half of the colours are warm, and the other half has any hue.
     """
     h = (rng.normal(0.08, 0.06) % 1 if rng.random() < 0.5 else rng.random()) if hue is None else rng.uniform(*hue) % 1
-    s, v = strength[0] + (strength[1] - strength[0]) * rng.random() ** 1.5, rng.uniform(*light)
+    s = strength[0] + (strength[1] - strength[0]) * rng.random() ** 1.5
+    v = rng.uniform(*light)
     pure = np.clip(np.abs(np.mod(6 * h + np.array([0, 4, 2]), 6) - 3) - 1, 0, 1)  # RGB of the hue at s = v = 1
     return (v * (1 - s * (1 - pure))).astype(np.float32)
 
@@ -158,7 +169,8 @@ def draw_plain(rng: np.random.Generator, size: int) -> Texture:
 def draw_plaster(rng: np.random.Generator, size: int) -> Texture:
     """Draw rough paint, stone or concrete."""
     low, high = draw_shades(rng, draw_color(rng, strength=(0, 0.3)), rng.uniform(0.1, 0.4))
-    clouds, grit = draw_octaves(rng, size, fade=0.6), draw_octaves(rng, size, first=64, fade=0.9)
+    clouds = draw_octaves(rng, size, fade=0.6)
+    grit = draw_octaves(rng, size, first=64, fade=0.9)
     return mix_colors(low, high, 0.6 * clouds + 0.4 * grit)
 
 
@@ -225,7 +237,8 @@ def draw_bricks(rng: np.random.Generator, size: int) -> Texture:
 def draw_cloth(rng: np.random.Generator, size: int) -> Texture:
     """Draw a weave with stripes or checks."""
     x, y = pixel_places(size)
-    count, base = int(rng.integers(3, 12)), draw_color(rng, strength=(0.1, 0.8))
+    count = int(rng.integers(3, 12))
+    base = draw_color(rng, strength=(0.1, 0.8))
     other = draw_color(rng, strength=(0.0, 0.7))
     bands = [(np.mod(count * c, 1) < rng.uniform(0.2, 0.6)).astype(np.float32) for c in (x, y)]
     kind = rng.integers(0, 3)
@@ -293,21 +306,27 @@ def draw_printed(rng: np.random.Generator, size: int) -> Texture:
         if paper.mean() > 0.45
         else draw_color(rng, light=(0.85, 1), strength=(0, 0.2))
     )
-    page, letters = np.tile(paper, (size, size, 1)).astype(np.float32), draw_letters(rng, 26)
-    margin, y = size // 16, size // 16
+    page = np.tile(paper, (size, size, 1)).astype(np.float32)
+    letters = draw_letters(rng, 26)
+    margin = size // 16
+    y = size // 16
     page[: size // 64] = page[:, : size // 64] = 0.7 * paper
     while y < size - 2 * margin:
-        chance, left = rng.random(), margin
-        is_heading, is_picture = chance < 0.2, chance > 0.8
+        chance = rng.random()
+        left = margin
+        is_heading = chance < 0.2
+        is_picture = chance > 0.8
         height = size // int(rng.integers(6, 12)) if is_heading else size // int(rng.integers(22, 44))
         width = int(rng.uniform(0.5, 1) * (size - 2 * margin))
         if is_picture:  # with text beside it
-            height, picture_width = int(rng.uniform(0.1, 0.25) * size), int(rng.uniform(0.2, 0.5) * size)
+            height = int(rng.uniform(0.1, 0.25) * size)
+            picture_width = int(rng.uniform(0.2, 0.5) * size)
             area = page[y : y + height, left : left + picture_width]
             area[:] = mix_colors(draw_color(rng), draw_color(rng), draw_octaves(rng, size, first=4, fade=0.6))[
                 : area.shape[0], : area.shape[1]
             ]
-            left, width = left + picture_width + margin // 2, size - 2 * margin - picture_width
+            left = left + picture_width + margin // 2
+            width = size - 2 * margin - picture_width
             height //= 4
         line = draw_text_line(rng, letters, height, max(8, width))
         area = page[y : y + height, left : min(left + width, size - margin)]
@@ -321,13 +340,16 @@ def draw_label(rng: np.random.Generator, size: int) -> Texture:
     x, y = pixel_places(size)
     page = mix_colors(draw_color(rng, strength=(0.3, 0.95)), draw_color(rng, strength=(0.2, 0.9)), np.abs(2 * y - 1))
     for _ in range(rng.integers(2, 6)):
-        cx, cy, r = rng.uniform(0, 1), rng.uniform(0, 1), rng.uniform(0.06, 0.3)
+        cx = rng.uniform(0, 1)
+        cy = rng.uniform(0, 1)
+        r = rng.uniform(0.06, 0.3)
         inside = np.square(x - cx) + np.square(y - cy) < r * r if rng.random() < 0.5 else np.abs(y - cy) < r / 3
         page = np.where(inside[..., None], draw_color(rng, strength=(0.1, 0.95)), page)
     letters = draw_letters(rng, 26)
     for _ in range(rng.integers(3, 9)):
         height = size // int(rng.integers(5, 30))
-        top, left = int(rng.integers(0, size - height)), int(rng.integers(0, size // 2))
+        top = int(rng.integers(0, size - height))
+        left = int(rng.integers(0, size // 2))
         area = page[top : top + height, left : left + int(rng.integers(size // 5, size // 2))]
         ink = draw_color(rng, strength=(0, 0.4), light=(0.85, 1) if rng.random() < 0.5 else (0, 0.2))
         area += (ink - area) * draw_text_line(rng, letters, height, area.shape[1])[..., None]
@@ -336,7 +358,9 @@ def draw_label(rng: np.random.Generator, size: int) -> Texture:
 
 def draw_spines(rng: np.random.Generator, size: int) -> Texture:
     """Draw the backs of a row of books of many colours."""
-    page, letters, x = np.zeros((size, size, 3), np.float32), draw_letters(rng, 26), 0
+    page = np.zeros((size, size, 3), np.float32)
+    letters = draw_letters(rng, 26)
+    x = 0
     while x < size:
         width = int(rng.uniform(0.02, 0.09) * size)
         book = page[:, x : x + width]
@@ -415,7 +439,8 @@ class Palette:
         """
         kind = kinds[self.rng.integers(len(kinds))]
         other_textures = 3  # most textures of any other kind
-        ids, limit = self.by_kind.setdefault(kind, []), MAX_TEXTURES.get(kind, other_textures)
+        ids = self.by_kind.setdefault(kind, [])
+        limit = MAX_TEXTURES.get(kind, other_textures)
         if len(ids) < limit:
             ids.append(len(self.textures))
             self.textures.append(KINDS[kind](self.rng, self.size).astype(np.float32))
