@@ -42,8 +42,12 @@ PROPERTIES: dict[Check, str] = {  # of the result
 }
 SEED = 7  # seed of all random choices
 MAX_WORSE = 0.1  # dB by which a result may be below its input
-MAX_SAME, MAX_NEAR = 0.2, 1.0  # dB that the result of a changed scene may lose compared with the unchanged scene
-SAME_COUNT, ONCE_COUNT = 0.005, 1.05  # largest relative difference of counts for "same", and largest ratio for "once"
+# dB that the result of a changed scene may lose compared with the unchanged scene
+MAX_SAME = 0.2
+MAX_NEAR = 1.0
+# largest relative difference of counts for "same", and largest ratio for "once"
+SAME_COUNT = 0.005
+ONCE_COUNT = 1.05
 _QUICK = EvaluateOptions(lpips=(), fog=False)
 
 
@@ -62,7 +66,8 @@ def keep_views(setup: StressScene, choose: Callable[[int], Sequence[int]]) -> St
 
 def scale_and_shift(setup: StressScene, factor: float, shift: Sequence[float]) -> StressScene:
     """Scale the world by ``factor``, then shift it by ``shift`` times the size that the scene has after scaling."""
-    scene, views = setup.scene, setup.views
+    scene = setup.scene
+    views = setup.views
     # the scene's present coordinates are taken as coordinates in ``frame``, and are then moved to the world
     frame = Frame(np.array(shift, np.float64) * scene_frame(scene).unit * factor, factor)
     scene = replace(scene, gaussians=frame.leave(scene.gaussians), cameras=frame.leave_cameras(scene.cameras))
@@ -71,7 +76,8 @@ def scale_and_shift(setup: StressScene, factor: float, shift: Sequence[float]) -
 
 def perturb_poses(setup: StressScene, degrees: float) -> StressScene:
     """Rotate every view and its Gaussians about the view's camera centre and a random axis."""
-    viewmats, rng = setup.scene.cameras.viewmats.astype(np.float64), np.random.default_rng(SEED)
+    viewmats = setup.scene.cameras.viewmats.astype(np.float64)
+    rng = np.random.default_rng(SEED)
     for viewmat in viewmats:
         axis = rng.normal(size=3)
         viewmat[:3] = cv2.Rodrigues(np.deg2rad(degrees) * axis / np.linalg.norm(axis))[0] @ viewmat[:3]
@@ -185,16 +191,19 @@ def stress(
     if len(scene) == 0:
         raise UsageError("expected a scene with views, got none")
     options = options or CompactOptions()
-    report, slack = progress or (lambda *_: None), _fit_slack(options)
+    report = progress or (lambda *_: None)
+    slack = _fit_slack(options)
     limits = {"same": MAX_SAME + slack, "near": MAX_NEAR + slack, "worse": MAX_WORSE}
     setup = StressScene(scene, targets)
     base = _compact_and_score(setup, options)
     out = []
     for i, name in enumerate(names):
-        case, start = CASES[name], time.perf_counter()
+        case = CASES[name]
+        start = time.perf_counter()
         report(case.words, i, len(names))
         passed, measured = _check_case(case, setup, base, options)
-        seconds, expected = time.perf_counter() - start, PROPERTIES[case.check].format(**limits)
+        seconds = time.perf_counter() - start
+        expected = PROPERTIES[case.check].format(**limits)
         out.append(StressOutcome(name, case.words, expected, passed, measured, seconds))
     report("done", len(names), len(names))
     return tuple(out)

@@ -46,7 +46,8 @@ def log_determinants(covars: Floats) -> Floats:
 
 def pair_costs(cloud: Cloud, left: Ints, right: Ints) -> Floats:
     """Compute the costs ``[m]`` of merging pairs: Runnalls' bound per mass plus the squared distance of harmonics."""
-    masses, covars = cloud.masses.astype(np.float64), cloud.covars.astype(np.float64)
+    masses = cloud.masses.astype(np.float64)
+    covars = cloud.covars.astype(np.float64)
     share = (masses[left] / (masses[left] + masses[right]))[:, None]  # share of the left Gaussian in the pair's mass
     offsets = cloud.means[left] - cloud.means[right]
     outer = np.stack([offsets[:, i] * offsets[:, j] for i, j in UPPER], 1)
@@ -78,7 +79,8 @@ def neighbor_pairs(cloud: Cloud) -> tuple[Ints, Ints, Floats]:
         is_repeat = (nearest[neighbors[lower]] == rows[lower, None]).any(1)
         keep = np.ones(len(rows), bool)
         keep[lower[is_repeat | (neighbors[lower] == rows[lower])]] = False
-        left, right = np.minimum(rows, neighbors)[keep], np.maximum(rows, neighbors)[keep]
+        left = np.minimum(rows, neighbors)[keep]
+        right = np.maximum(rows, neighbors)[keep]
         return left, right, pair_costs(cloud, left, right)
 
     chunks = parallel_map(chunk_pairs, range(0, len(cloud), CHUNK_GAUSSIANS))
@@ -94,9 +96,12 @@ def cheapest_disjoint(left: Ints, right: Ints, costs: Floats, limit: int) -> Int
     cheaper. Returns indices of pairs, by ascending cost.
     """
     order = np.argsort(costs, kind="stable")
-    left, right, ranks = left[order], right[order], np.arange(len(order))
+    left = left[order]
+    right = right[order]
+    ranks = np.arange(len(order))
     cheapest = np.empty(1 + int(right.max(initial=0)), np.int64)  # rank of the cheapest remaining pair of each Gaussian
-    is_merged, disjoint = np.zeros(len(cheapest), bool), np.empty(0, np.int64)
+    is_merged = np.zeros(len(cheapest), bool)
+    disjoint = np.empty(0, np.int64)
     while len(ranks):
         ends = np.stack([left[ranks], right[ranks]], 1)
         cheapest[ends[::-1].reshape(-1)] = np.repeat(ranks[::-1], 2)  # the cheapest pair is written last

@@ -34,7 +34,8 @@ def unmerged_fit(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
     Gaussians, so their number stays. ``count`` is ignored.
     """
     gaussians = prepared.scene.file_gaussians
-    start, options = Decoded(gaussians, len(gaussians), exact=False), replace(plan.fit, fit="full")
+    start = Decoded(gaussians, len(gaussians), exact=False)
+    options = replace(plan.fit, fit="full")
     return fit_scene(start, prepared.scene, options, plan.seed).gaussians
 
 
@@ -87,7 +88,8 @@ def splat_transform(prepared: Prepared, plan: Plan, count: int) -> Gaussians:
     if len(gaussians) <= count:
         return gaussians
     with tempfile.TemporaryDirectory(prefix="gsmerge-") as folder:
-        before, after = Path(folder) / "in.ply", Path(folder) / "out.ply"
+        before = Path(folder) / "in.ply"
+        after = Path(folder) / "out.ply"
         write_ply(before, gaussians)
         with stage("reduce"):
             run_program(before, "-d", count, after)

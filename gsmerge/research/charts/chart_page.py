@@ -68,7 +68,8 @@ def _mean_table(results: Results) -> ChartTable:
         )
         row = [name, size, str(len(group)), f"{count:,.0f}", f"{kept:.3g} %", f"{num_bytes:,.0f}", f"{seconds:.2f}"]
         for metric in results.metrics:
-            digits, values = CHART_METRICS[metric].digits, [r.value(f"{metric}_{results.part}") for r in group]
+            digits = CHART_METRICS[metric].digits
+            values = [r.value(f"{metric}_{results.part}") for r in group]
             known = [value for value in values if value is not None]
             score_text = f"{sum(known) / len(known):.{digits}f}" if known else ""
             if (interval := intervals.get((metric, name, size))) and interval.count >= MIN_SCENES:

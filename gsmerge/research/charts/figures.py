@@ -20,7 +20,10 @@ from gsmerge.io import atomic_output
 from gsmerge.research.charts.lines import CHART_METRICS, MIN_SCENES, PARTS, Line, Results
 from gsmerge.research.charts.measure_run import INPUT
 
-PANEL_WIDTH, SINGLE_WIDTH, PANEL_HEIGHT = 2.9, 4.4, 2.5  # inches: one of several panels, the only panel
+# inches: one of several panels, the only panel
+PANEL_WIDTH = 2.9
+SINGLE_WIDTH = 4.4
+PANEL_HEIGHT = 2.5
 # The first six colours are those of Okabe and Ito (2008)
 LINE_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7B4173", "#8C6D31")
 MARKERS = "osD^vPX"  # 7 markers and 8 colours, so 56 lines have different pairs of marker and colour
@@ -92,7 +95,8 @@ def _plot_against(results: Results, cost: str, name: str, title: str, cost_words
         score = f"{metric}_{results.part}"
         lines = results.by_size(cost, score)
         scenes = {scene for line in lines for point in line.points for scene in point.by_scene}
-        y_label, higher = CHART_METRICS[metric].label, CHART_METRICS[metric].higher
+        y_label = CHART_METRICS[metric].label
+        higher = CHART_METRICS[metric].higher
         if lines:
             panels.append(Panel(y_label, higher, tuple(lines), results.input_mean(score, scenes)))
     if not panels:
@@ -126,7 +130,8 @@ def draw_figures(figures: Sequence[Chart], folder: Path) -> dict[str, bytes]:
     """
     folder.mkdir(parents=True, exist_ok=True)
     names = dict.fromkeys((line.name, line.is_own) for f in figures for panel in f.panels for line in panel.lines)
-    drawn, styles = {}, line_styles(names)
+    drawn = {}
+    styles = line_styles(names)
     for figure in figures:
         with matplotlib.rc_context():
             matplotlib.rcdefaults()  # the user's own settings have no effect
@@ -158,7 +163,9 @@ def line_styles(names: Iterable[tuple[str, bool]]) -> dict[str, Style]:
 def draw_curves(figure: Chart, styles: Mapping[str, Style]) -> Drawing:
     """Draw a figure's panels side by side, with one legend beside them."""
     num_panels = len(figure.panels)
-    legend_width, legend_line = 2.3, 0.135  # width of the legend, and height of its lines, inches
+    # width of the legend, and height of its lines, inches
+    legend_width = 2.3
+    legend_line = 0.135
     width = (SINGLE_WIDTH if num_panels == 1 else PANEL_WIDTH * num_panels) + legend_width
     names = list(dict.fromkeys(line.name for panel in figure.panels for line in panel.lines))
     names += [INPUT] * (INPUT not in names and any(panel.reference is not None for panel in figure.panels))
@@ -184,8 +191,10 @@ def draw_curves(figure: Chart, styles: Mapping[str, Style]) -> Drawing:
 
 def _draw_line(axes: Axes, line: Line, style: Style) -> None:
     """Draw a line, with a band of intervals if there are enough scenes."""
-    x, y = [p.x for p in line.points], [p.y.mean for p in line.points]
-    low, high = [p.y.low for p in line.points], [p.y.high for p in line.points]
+    x = [p.x for p in line.points]
+    y = [p.y.mean for p in line.points]
+    low = [p.y.low for p in line.points]
+    high = [p.y.high for p in line.points]
     if min(p.y.count for p in line.points) >= MIN_SCENES and low != high:
         band = {"color": style["color"], "zorder": style["zorder"] - 1}
         if len(x) > 1:

@@ -92,7 +92,8 @@ def find_sources(arguments: Sequence[str], out: Path, targets: str | None = None
     scenes = list({main_file(scene).resolve(): scene for scene in find_scenes(arguments, out)}.values())
     sources = []
     for scene, name in zip(scenes, scene_names(scenes), strict=True):
-        cameras, read = fill_template(targets, scene), list_files(find_scene_files(scene))
+        cameras = fill_template(targets, scene)
+        read = list_files(find_scene_files(scene))
         if cameras is not None:
             if not cameras.exists():
                 raise SceneError(cameras, f"expected cameras of held-out views of {scene}, found nothing")

@@ -83,7 +83,8 @@ def mean_interval(values: Sequence[float]) -> Interval:
     if not len(values):
         raise ValueError("expected at least one value, got none")
     array = np.asarray(values, np.float64)
-    mean, half = float(array.mean()), 0.0
+    mean = float(array.mean())
+    half = 0.0
     if len(array) > 1:
         factor = float(stdtrit(len(array) - 1, 0.5 + CONFIDENCE / 2))
         half = factor * float(array.std(ddof=1)) / math.sqrt(len(array))
@@ -195,7 +196,8 @@ def make_lines(records: Sequence[RunRecord], x: str, y: str) -> list[Line]:
     """
     measured: dict[tuple[LineKey, str], dict[str, tuple[float, float]]] = {}  # cost and score by point, then by scene
     for record in sorted(records, key=lambda record: record.percent):
-        cost, score = record.value(x), record.value(y)
+        cost = record.value(x)
+        score = record.value(y)
         if cost and score is not None:
             measured.setdefault((line_key(record), size_label(record)), {})[record.scene] = float(cost), score
     common = keep_common({point: set(by_scene) for point, by_scene in measured.items()})

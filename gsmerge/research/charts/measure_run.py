@@ -92,10 +92,12 @@ def run_setting(source: ChartScene, record: RunRecord, options: CompactOptions, 
     """
     scene, held_out, notes = load_source(source)
     if record.method == INPUT:
-        gaussians, seconds = scene.file_gaussians, 0.0
+        gaussians = scene.file_gaussians
+        seconds = 0.0
     else:
         result = compact(scene, options)
-        gaussians, notes = result.gaussians, (*notes, *result.report.notes)
+        gaussians = result.gaussians
+        notes = (*notes, *result.report.notes)
         seconds = sum(time for name, time in result.report.seconds.items() if name not in SCORING)
     # Means by name (``psnr_target_visible``, ...); names without a measurement are left out
     results = {} if record.method == INPUT else {"result": gaussians}

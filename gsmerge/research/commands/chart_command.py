@@ -22,7 +22,10 @@ if TYPE_CHECKING:
     from gsmerge.research.charts.grid import GridRun
     from gsmerge.scoring.evaluate import EvaluateOptions
 
-CHARTS, PAGE, TABLE = "charts", "index.html", "runs.csv"  # a folder and two files in the output folder
+# a folder and two files in the output folder
+CHARTS = "charts"
+PAGE = "index.html"
+TABLE = "runs.csv"
 
 
 @dataclass(frozen=True)

@@ -44,7 +44,8 @@ def generate(
     from gsmerge.research.generate import generate as generate_scenes
     from gsmerge.runtime.documents import document_head, note_entries
 
-    given, (width, height) = opt.read_settings(SETTINGS, set), size
+    given = opt.read_settings(SETTINGS, set)
+    width, height = size
     options, series = given.make(GenerateOptions, SeriesOptions, views=views, width=width, height=height)
     if output.exists() and not output.is_dir():
         raise SceneError(output, "expected a folder to write scenes to, found a file", "name another")

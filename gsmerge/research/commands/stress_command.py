@@ -40,7 +40,8 @@ def stress(
     from gsmerge.runtime.documents import document_head, note_entries
 
     settings, places = opt.read_settings(SETTINGS, set).make(*SETTINGS)
-    cameras, images = opt.path_or_none(places.cameras), opt.path_or_none(places.images)
+    cameras = opt.path_or_none(places.cameras)
+    images = opt.path_or_none(places.images)
     load = read_files(find_scene_files(scene, cameras=cameras, images=images))
     require_views(load)
     targets, target_images = map(opt.read_path, (places.targets, places.target_images))

@@ -70,7 +70,8 @@ def find_training_scenes(paths: Sequence[Path], out: Path, validation_scenes: Co
     from gsmerge.errors import UsageError
     from gsmerge.jobs.batch.find import find_scenes
 
-    kept, excluded = dict[str, Path](), {os.path.realpath(scene) for scene in validation_scenes}
+    kept = dict[str, Path]()
+    excluded = {os.path.realpath(scene) for scene in validation_scenes}
     for path in paths:
         for scene in find_scenes([str(path)], out):
             real = os.path.realpath(scene)

@@ -21,7 +21,9 @@ from gsmerge.types import Cameras, Gaussians, Pixels, Scene, Views
 
 # Photos [v,h,w,3], sRGB in [0, 1], and their cameras -> v·h·w Gaussians, view by view, in the world of the cameras
 Backbone = Callable[[np.ndarray, Cameras], Gaussians]
-FEWEST_VIEWS, MOST_VIEWS = 1, 12  # views that are drawn, as in the paper
+# views that are drawn, as in the paper
+FEWEST_VIEWS = 1
+MOST_VIEWS = 12
 NOVEL_PHOTOS = 4  # photos of other views beside those that are drawn, since a capture may have hundreds
 
 
@@ -54,9 +56,11 @@ class Capture:
         least, most = (min(count, num_views) for count in options.random_views or (FEWEST_VIEWS, MOST_VIEWS))
         order = rng.permutation(num_views)
         count = int(rng.integers(least, most + 1))
-        ids, others = sorted(order[:count].tolist()), sorted(order[count : count + NOVEL_PHOTOS].tolist())
+        ids = sorted(order[:count].tolist())
+        others = sorted(order[count : count + NOVEL_PHOTOS].tolist())
         density = options.densities[int(rng.integers(len(options.densities)))]
-        given, images = self.views.cameras[ids], np.asarray(self.views.images)
+        given = self.views.cameras[ids]
+        images = np.asarray(self.views.images)
         with self.lock, torch.no_grad():
             predicted = self.backbone(images[ids], given).numpy()
         shape = count, given.height, given.width

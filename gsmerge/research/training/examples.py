@@ -82,7 +82,8 @@ def make_examples(path: Path, options: TrainOptions) -> Iterator[tuple[str, Call
     Gaussian per pixel, or has no photos.
     """
     load = load_scene(path)
-    scene, ply = load.scene, load.files.ply
+    scene = load.scene
+    ply = load.files.ply
     if not scene.has_own_pixels:
         raise SceneError(ply, "expected one Gaussian per pixel to learn from, found none")
     if scene.images is None:
@@ -106,7 +107,9 @@ def example_name(path: Path) -> str:
 def make_example(training: TrainingScene, options: TrainOptions, density: float, name: str) -> Example:
     """Segment and encode a scene without networks, by ``density`` superpixels per pixel, into the example ``name``."""
     changes = {"superpixels": share_text(density), "segmentation": options.segmentation, "seed": options.seed}
-    settings, scene, members = CompactOptions().with_settings(changes), training.scene, training.members
+    settings = CompactOptions().with_settings(changes)
+    scene = training.scene
+    members = training.members
     features = encode(scene, members, segment(scene_pictures(scene), settings.segment))
     level = options.photo_level(scene.cameras.width, scene.cameras.height)
     images = (training.photos(level).images.clip(0, 1) * 255).round().astype(np.uint8)
@@ -121,7 +124,8 @@ def make_example(training: TrainingScene, options: TrainOptions, density: float,
 
 def select_example_views(example: Example, ids: Sequence[int]) -> Example:
     """Keep the views ``ids`` (ascending) of an example; photos of other views become novel views."""
-    num_views, members = len(example.cameras), example.members
+    num_views = len(example.cameras)
+    members = example.members
     if len(ids) == num_views:
         return example
     new_views = np.full(num_views, -1)  # new number of each view; -1 if it is left out
@@ -162,7 +166,8 @@ def draw_random_views(example: Example, options: TrainOptions, rng: np.random.Ge
 def recolor(example: Example, rng: np.random.Generator) -> Example:
     """Change the colours of an example at random: permute channels, reduce the contrast, and perhaps invert them."""
     gain = float(rng.uniform(0.6, 1))
-    low, inverted = float(rng.uniform(0, 1 - gain)), bool(rng.random() < 0.5)
+    low = float(rng.uniform(0, 1 - gain))
+    inverted = bool(rng.random() < 0.5)
     colors = ColorMap(tuple(rng.permutation(3).tolist()), -gain if inverted else gain, low + gain * inverted)
     changed: dict[str, Any] = {}
     for name in ("members", "features", "base"):

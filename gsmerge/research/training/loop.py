@@ -56,7 +56,8 @@ def validate(networks: Networks, shards: Sequence[Shard | Capture], options: Tra
     scores = list[tuple[float, float, float]]()
     for number, shard in enumerate(shards):
         rng = np.random.default_rng([options.seed, VALIDATION, number])  # a shard gets the same windows every time
-        read, windows = lru_cache(1)(read_shard), list[Window]()
+        read = lru_cache(1)(read_shard)
+        windows = list[Window]()
         for _ in range(options.validation_windows):
             part = draw_example(shard, options, rng, read)
             windows.append(sample_window(part, options.levels, options.window, options.most, novel=1, rng=rng))
@@ -133,14 +134,19 @@ def train(
             networks = Networks(options.network)
         optimizer = torch.optim.AdamW(networks.parameters(), lr=options.rate, weight_decay=options.decay)
         state = TrainingState(networks, deepcopy(networks).requires_grad_(False), optimizer)
-        step, rows, path = 0, list[LossRow](), out / "state.safetensors"
+        step = 0
+        rows = list[LossRow]()
+        path = out / "state.safetensors"
         if path.exists():
             stored = load_training(path, state)
             for name, value in facts.items():
                 if stored.get(name) != value:
                     raise SceneError(path, f"expected a run with the same {name}, found another", RUN_REMEDY)
-            step, rows = int(stored["step"]), list(stored["rows"])
-        resumed, losses, read = step, list[Tensor](), lru_cache(options.buffer)(read_shard)
+            step = int(stored["step"])
+            rows = list(stored["rows"])
+        resumed = step
+        losses = list[Tensor]()
+        read = lru_cache(options.buffer)(read_shard)
         while step < options.steps:
             losses.append(_take_step(state, shards, read, options, step))
             step += 1

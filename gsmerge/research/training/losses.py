@@ -39,7 +39,8 @@ def lpips_loss(image: Tensor, reference: Tensor, mask: Tensor, net: str = "vgg")
     """
     if min(image.shape[:2]) < min_size(net) or not bool(mask.any()):
         return image.new_zeros(())
-    layers, kernels = read_layers(net), _kernels(net)
+    layers = read_layers(net)
+    kernels = _kernels(net)
     with torch.no_grad():
         reference_features = list(_unit_features(reference, layers, kernels))
     visible = torch.where(mask[..., None], image, reference)
@@ -81,11 +82,15 @@ def window_loss(
     levels. The weight of the diversity loss is relative to the photometric loss, because the diversity loss has no
     natural scale.
     """
-    crop, background = window.crop, rng.random(3, dtype=np.float32)
+    crop = window.crop
+    background = rng.random(3, dtype=np.float32)
     levels = options.levels if options.joint else (crop.k,)
     teacher, diversity = options.regularizer_weights(step)
-    photo, mask, lpips_weight = window.image, window.mask, options.lpips_weight_at(step)
-    refined, total = refine_crop(crop, networks, options, step), torch.zeros(())
+    photo = window.image
+    mask = window.mask
+    lpips_weight = options.lpips_weight_at(step)
+    refined = refine_crop(crop, networks, options, step)
+    total = torch.zeros(())
     for k in levels:
         prediction = decode_crop(refined, crop, k)
         # The loss of a render: difference of colours, 1 - SSIM, and LPIPS in the steps that use it
@@ -127,7 +132,8 @@ def loss_ssim(image: Tensor, photo: Tensor) -> Tensor:
     """
     stacked = torch.stack([image, photo, image * image, photo * photo, image * photo]).permute(0, 3, 1, 2)
     mx, my, xx, yy, xy = functional.avg_pool2d(stacked, WINDOW_SIDE, 1, WINDOW_SIDE // 2).permute(0, 2, 3, 1)
-    c1, c2 = float(C1), float(C2)
+    c1 = float(C1)
+    c2 = float(C2)
     numerator = (2 * mx * my + c1) * (2 * (xy - mx * my) + c2)
     return numerator / ((mx * mx + my * my + c1) * (xx - mx * mx + yy - my * my + c2))
 
@@ -150,10 +156,12 @@ def render_window(window: Window, networks: Networks | None, options: TrainOptio
     """
     with torch.no_grad():
         if networks is None:
-            gaussians, matched = analytic_gaussians(window.crop, options).to("cpu"), 0.0
+            gaussians = analytic_gaussians(window.crop, options).to("cpu")
+            matched = 0.0
         else:
             prediction = predict(window.crop, networks, options, 0)
-            gaussians, matched = prediction.gaussians, prediction.matched
+            gaussians = prediction.gaussians
+            matched = prediction.matched
         return draw_window(gaussians, window, np.zeros(3, np.float32)).clamp(0, 1), matched
 
 
@@ -173,12 +181,14 @@ def teacher_loss(prediction: Prediction, members: Members) -> Tensor:
     opacities and base colours. Distances between means are in units of the teacher's size. A Gaussian has 24 equivalent
     pairs of rotation and scales, of which the pair nearest to the prediction is used.
     """
-    g, merged = prediction.gaussians, prediction.merged
+    g = prediction.gaussians
+    merged = prediction.merged
     if len(g) == 0:
         return g.means.new_zeros(())
     moments = pool_members(members, merged.starts, merged.members, "paper")
     teacher = to_gaussians(moments.covars, moments.extinctions, moments.means, moments.sh).to("cpu")[prediction.parents]
-    scales, quats = teacher.scales, teacher.quats
+    scales = teacher.scales
+    quats = teacher.quats
     # A Gaussian does not change if its rotation is multiplied by one of the 24 signed permutations of axes, and its
     # scales are permuted alike. ``orders [n,3,3]`` are those with which the teacher is nearest to the prediction
     signed = torch.stack([torch.diag(torch.tensor(signs)) for signs in product((1.0, -1.0), repeat=3)])
@@ -201,7 +211,9 @@ def teacher_loss(prediction: Prediction, members: Members) -> Tensor:
     return torch.stack([part.mean() for part in parts]).sum()
 
 
-GEOMETRY_WEIGHT, OPACITY_WEIGHT = 0.75, 0.25  # weights of the two terms of diversity_loss
+# weights of the two terms of diversity_loss
+GEOMETRY_WEIGHT = 0.75
+OPACITY_WEIGHT = 0.25
 
 
 def diversity_loss(gaussians: Gaussians, parents: Tensor, sizes: Tensor) -> Tensor:
@@ -239,7 +251,8 @@ def overlap_profile(gaussians: Gaussians, left: Tensor, right: Tensor) -> Tensor
     axes = quat_to_rotmat(gaussians.quats) * gaussians.scales[:, None]
     halves = axes.norm(dim=2)
     away = (gaussians.means[left] - gaussians.means[right]).abs()
-    a, b = halves[left], halves[right]
+    a = halves[left]
+    b = halves[right]
     shared = torch.minimum(torch.minimum(a + b - away, 2 * a), 2 * b).clamp_min(0).prod(1)
     union = (8 * a.prod(1) + 8 * b.prod(1) - shared).clamp_min(1e-30)
     overlaps = shared / union

@@ -121,7 +121,8 @@ class SetNetwork(nn.Module):
     def __init__(self, token_width: int, out: int, options: NetworkOptions) -> None:
         """Make the layers for tokens of ``token_width`` numbers, and a result of ``out`` numbers."""
         super().__init__()
-        width, heads = options.width, options.heads
+        width = options.width
+        heads = options.heads
         self.embed = mlp(token_width, width, width)
         self.blocks = nn.ModuleList(AttentionBlock(width, heads) for _ in range(options.blocks))
         self.pool, self.join = Pooling(width, heads), mlp(width + GROUP_COLUMNS, 2 * width, out)
@@ -189,7 +190,8 @@ class Refiner(nn.Module):
     def __init__(self, options: NetworkOptions) -> None:
         """Make the layers. The last block computes only the token of the Feature Gaussian itself."""
         super().__init__()
-        width, last = options.width, options.refine_blocks - 1
+        width = options.width
+        last = options.refine_blocks - 1
         self.embed = mlp(PART_COLUMNS + 1 + options.latent, width, width)
         self.blocks = nn.ModuleList(
             AttentionBlock(width, options.heads, first_only=i == last) for i in range(options.refine_blocks)

@@ -102,7 +102,8 @@ def differentiate_groups(features: FeatureGaussians, inputs: GroupFeatures, view
     ``inputs`` are the arrays that the kernels made: views, footprints and statistics are taken from them.
     """
     group_viewmats = torch.from_numpy(viewmats[inputs.views]).float()
-    base, frames = differentiate_base(features), torch.from_numpy(inputs.frames)
+    base = differentiate_base(features)
+    frames = torch.from_numpy(inputs.frames)
     if features.means.requires_grad:
         # A frame depends on the group's mean and on its view. It has no gradient if the ray to the mean is parallel to
         # the image's right axis
@@ -138,7 +139,8 @@ def differentiate_tokens(
 
     The function and its arguments are those of :func:`gsmerge.method.networks.tokens.part_tokens`.
     """
-    g, owner_ids = group_features, torch.from_numpy(owners)
+    g = group_features
+    owner_ids = torch.from_numpy(owners)
     selected = parts[torch.from_numpy(ids)]
     to_frames = g.frames[owner_ids].transpose(1, 2)
     pixels = torch.from_numpy(g.footprints)[owner_ids].clamp_min(TINY)
@@ -231,7 +233,8 @@ class TrainingContext(NetworkContext):
 
         The corrections are those of :func:`gsmerge.method.networks.corrections.move_features`.
         """
-        g, f = group_features, group_features.features
+        g = group_features
+        f = group_features.features
         # Rotations of the rotation vectors (Rodrigues), also differentiable at zero
         vectors = rotate_vectors(g.frames, residuals[:, ROTATION_COLUMNS])
         x, y, z = vectors.unbind(1)
@@ -240,7 +243,8 @@ class TrainingContext(NetworkContext):
         angles = (vectors.square().sum(1) + 1e-12).sqrt()[:, None, None]
         rotations = torch.eye(3) + torch.sin(angles) / angles * cross
         rotations = rotations + (1 - torch.cos(angles)) / angles**2 * cross @ cross
-        axes, log_stretches = quat_to_rotmat(g.base.quats), residuals[:, SIZE_COLUMNS]
+        axes = quat_to_rotmat(g.base.quats)
+        log_stretches = residuals[:, SIZE_COLUMNS]
         stretches = torch.eye(3) + (axes * torch.expm1(log_stretches)[:, None]) @ axes.transpose(1, 2)
         changes = rotations @ stretches
         covars = changes @ f.covars @ changes.transpose(1, 2)
@@ -270,9 +274,11 @@ class TrainingContext(NetworkContext):
         Heads whose outputs are "absolute" make children by correcting round Gaussians.
         """
         if children is None:
-            arrays, parent_ids = groups_to_arrays(group_features), torch.from_numpy(parents)
+            arrays = groups_to_arrays(group_features)
+            parent_ids = torch.from_numpy(parents)
             round_gaussians = prepare_children(arrays.base[parents], parents, arrays, self.options).to("cpu")
-            frames, base = group_features.frames[parent_ids], group_features.base
+            frames = group_features.frames[parent_ids]
+            base = group_features.base
             rotations = (frames - frames.detach()) @ frames.detach().transpose(1, 2)  # zero, with a gradient
             children = replace(
                 round_gaussians,
@@ -327,7 +333,8 @@ def decode_crop(refined: RefinedCrop, crop: Crop, k: int) -> Prediction:
     If ``k`` is more than 1, the closed formulas make the children from the members, without a gradient. Earlier stages
     then get gradients only through the inputs of the heads. Heads with "absolute" outputs make the children themselves.
     """
-    described, context = refined.described, refined.context
+    described = refined.described
+    context = refined.context
     arrays = features_to_arrays(described.features)
     children: Gaussians | None = None
     parents = np.repeat(np.arange(len(arrays)), k)
@@ -337,7 +344,8 @@ def decode_crop(refined: RefinedCrop, crop: Crop, k: int) -> Prediction:
         divided, parents = divide_groups(arrays, crop.example.members, np.full(len(arrays), k))
         children = divided.to("cpu")
     gaussians = context.correct_children(children, parents, described)
-    parent_ids, counts = torch.from_numpy(parents), np.bincount(refined.matches.clusters)
+    parent_ids = torch.from_numpy(parents)
+    counts = np.bincount(refined.matches.clusters)
     matched = float(counts[counts > 1].sum()) / max(1, len(refined.matches.clusters))
     return Prediction(gaussians, parent_ids, arrays, described.sizes[parent_ids], matched)
 

@@ -51,9 +51,11 @@ def make_training_scene(scene: Scene, ids: Sequence[int], held_out: Views | None
     canonical, frame = canonicalise(part)
     other_views = [view for view in range(len(scene)) if view not in set(ids)]
     order = [*ids, *other_views]
-    cameras, images = scene.cameras[order], scene.images[order]
+    cameras = scene.cameras[order]
+    images = scene.images[order]
     if held_out is not None:
-        width, height = cameras.width, cameras.height
+        width = cameras.width
+        height = cameras.height
         cameras = concat_cameras(cameras, resize_cameras(held_out.cameras, width, height))
         resized = [resize_photo(image, width, height) for image in held_out.images]
         images = np.concatenate([images, np.stack(resized)])

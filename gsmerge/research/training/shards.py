@@ -62,7 +62,8 @@ def prepare_shards(
     shards: list[Shard] = []
     for number, scene in enumerate(scenes):
         progress(f"examples: {example_name(scene)}", number, len(scenes))
-        key, name = scene_key(scene, options), example_name(scene)
+        key = scene_key(scene, options)
+        name = example_name(scene)
         record = folder / f"{key[:32]}.json"
         hashes = _read_hashes(record)
         if hashes is None:

@@ -86,18 +86,22 @@ def sample_window(
     """
     k = levels[int(rng.integers(len(levels)))]
     num_views = len(example.cameras)
-    own_photos, novel_photos = rng.permutation(num_views), num_views + rng.permutation(len(example.photos) - num_views)
+    own_photos = rng.permutation(num_views)
+    novel_photos = num_views + rng.permutation(len(example.photos) - num_views)
     order = np.concatenate([novel_photos, own_photos] if rng.random() < novel else [own_photos, novel_photos])
     # The first photo with pixels that the views cover is taken; if there is none, the last photo
-    photo, pixels = int(order[0]), np.zeros(0, np.int64)
+    photo = int(order[0])
+    pixels = np.zeros(0, np.int64)
     for photo in map(int, order):
         pixels = np.flatnonzero(example.mask(photo))
         if len(pixels):
             break
     pixel = int(pixels[rng.integers(len(pixels))]) if len(pixels) else 0
     photo_height, photo_width = example.images.shape[1:3]
-    width, height = min(side, photo_width), min(side, photo_height)
-    left, top = max(0, pixel % photo_width - width // 2), max(0, pixel // photo_width - height // 2)
+    width = min(side, photo_width)
+    height = min(side, photo_height)
+    left = max(0, pixel % photo_width - width // 2)
+    top = max(0, pixel // photo_width - height // 2)
     # The box is moved so that it lies inside the photo
     box = Box(min(left, photo_width - width), min(top, photo_height - height), width, height)
     rows = _reaching_rows(example, photo, box)
