@@ -138,13 +138,15 @@ def _join_comments(infos: Sequence[FileInfo], format_: Format, *, moves: bool) -
 
 def conversion_line(document: dict[str, Any]) -> str:
     """Describe the document of :func:`convert_files` in one line of text."""
-    before, after = sum(entry["num_gaussians"] for entry in document["inputs"]), document["output"]
+    before = sum(entry["num_gaussians"] for entry in document["inputs"])
+    after = document["output"]
     total = "" if after["num_gaussians"] == before and not document["dropped"] else f" of {before:,}"
     reasons = describe_counts(document["dropped"], placed=document["cameras"] is None)
     left_out = f" (left out: {reasons})" if reasons else ""
     camera_path = document["viewer_cameras"]
     cameras = f"; cameras in {Path(camera_path).name}" if camera_path else ""
-    count, size = f"{after['num_gaussians']:,}{total} Gaussians{left_out}", human_bytes(after["bytes"])
+    count = f"{after['num_gaussians']:,}{total} Gaussians{left_out}"
+    size = human_bytes(after["bytes"])
     return f"{after['path']}: {count}, {size}{cameras}"
 
 
@@ -165,7 +167,8 @@ def _find_cameras(options: ConvertOptions) -> tuple[CameraFile | None, list[str]
 
     If the cameras of the first input cannot be read, a note says so, and None is returned in place of cameras.
     """
-    named, first_input = options.cameras, options.inputs[0]
+    named = options.cameras
+    first_input = options.inputs[0]
     path = result_cameras(first_input) if named is None else named_path(named)
     try:
         return None if path is None else read_cameras(path), []
@@ -186,7 +189,9 @@ def _clean_joined(
     drops = options.clean.drops
     if not {"sky", "unseen"} & set(drops) or len(gaussians) == 0:
         return clean(gaussians, options.clean, None, None, lambda g: g)
-    photos, images, cameras = named_path(options.images), None, None
+    photos = named_path(options.images)
+    images = None
+    cameras = None
     if "sky" in drops and (stored is None or photos is None):
         problem = "expected photos and their cameras, which show where the sky is"
         raise UsageError(f"--drop sky: {problem}; give --images")

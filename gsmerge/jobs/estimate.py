@@ -77,7 +77,8 @@ class RunCosts:
 
     def build_seconds(self, count: float, steps: int) -> float:
         """Return the processor seconds to build ``count`` Gaussians with a fit of ``steps``."""
-        settings, method = self.settings, self.settings["method"]
+        settings = self.settings
+        method = self.settings["method"]
         work = COST_PAIRS if self.merges_pairs else COST_BUILD
         work += COST_SLOW.get(settings["segmentation"] if method == OURS else method, 0.0)
         if method == OURS and settings["checkpoint"] != "none":
@@ -87,7 +88,8 @@ class RunCosts:
 
     def seconds(self, count: float, coarser: Iterable[float], num_views: int, threads: int) -> float:
         """Return the wall time of a run for ``count`` Gaussians, and for the ``coarser`` levels, with imports."""
-        build, (curve_counts, curve_steps) = self.build_seconds(count, self.steps), self.curve
+        build = self.build_seconds(count, self.steps)
+        curve_counts, curve_steps = self.curve
         work = build * (self.num_builds + TRIAL_SHARE * self.has_trial)
         work += sum(self.build_seconds(point_count, curve_steps) for point_count in curve_counts)
         work += sum(self.build_seconds(level_count, self.steps) for level_count in coarser)
@@ -194,7 +196,8 @@ def estimate_lines(run: Mapping[str, Any]) -> list[str]:
 
 def estimate_files(load: Loaded, settings: CompactOptions, outputs: Outputs) -> dict[str, Any]:
     """Return the document of ``--dry-run``: what :func:`gsmerge.run.compact_files` would make."""
-    scene, out = load.scene, outputs.result
+    scene = load.scene
+    out = outputs.result
     notes = [*load.notes, *views_notes(scene)]
     if os.path.lexists(out) and not outputs.overwrite:
         notes.append(f"{out} exists already: --overwrite would replace it")
@@ -219,8 +222,10 @@ def estimate_files(load: Loaded, settings: CompactOptions, outputs: Outputs) -> 
 
 def dry_run_lines(document: Mapping[str, Any]) -> list[str]:
     """Describe the document of :func:`estimate_files` in lines of text."""
-    scene, out = document["input"], document["output"]["path"]
-    number, size = scene["num_views"], f"{scene['width']} x {scene['height']}"
+    scene = document["input"]
+    out = document["output"]["path"]
+    number = scene["num_views"]
+    size = f"{scene['width']} x {scene['height']}"
     inside = find_format(out).levels == "inside"
     levels = f", and {count_words(document['options']['levels'], 'level')} in chunks beside it" if inside else ""
     return [

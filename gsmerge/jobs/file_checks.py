@@ -64,8 +64,10 @@ def check_content(path: Path, *, opacity: OpacityChoice = "auto", hints: ReadHin
             file_check = _read_other(path)
         else:
             load = read_files(find_scene_files(path), opacity=opacity, hints=hints)
-            info, images = load.info, load.scene.images
-            notes, num_photos = (*load.notes, *degree_notes(info)), 0 if images is None else len(images)
+            info = load.info
+            images = load.scene.images
+            notes = (*load.notes, *degree_notes(info))
+            num_photos = 0 if images is None else len(images)
             file_check = FileCheck(
                 str(path), "Gaussians", info.count, info.layout, info.file_bytes, notes=notes,
                 num_views=len(load.scene), num_photos=num_photos,

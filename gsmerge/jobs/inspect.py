@@ -109,7 +109,8 @@ def inspect(
         report_progress("inspect: reading", 0, 3)
         ply = read_gaussian_file(files, opacity=opacity, hints=read_hints)
         report_progress("inspect: Gaussians", 1, 3)
-        info, opacities = ply.info, ply.gaussians.opacities[ply.valid]
+        info = ply.info
+        opacities = ply.gaussians.opacities[ply.valid]
         opaque = 0.995  # above this opacity, optical depths are capped
         saturated = 1e-6  # float32 changes the logit of an opacity that is nearer to 0 or 1 than this
         described = {
@@ -130,7 +131,8 @@ def inspect(
 
 def _describe_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> dict[str, Any]:
     """Describe the views of a scene, and whether its rows belong to pixels; see :func:`inspect` for the keys."""
-    is_result, expected = is_from_gsmerge(ply.info.comments), read_expected_scores(ply.info.comments)
+    is_result = is_from_gsmerge(ply.info.comments)
+    expected = read_expected_scores(ply.info.comments)
     facts: dict[str, Any] = {
         "cameras": files.cameras and str(files.cameras),
         "images": files.images and str(files.images),
@@ -178,7 +180,8 @@ def _describe_scene(load: Loaded, *, is_result: bool) -> dict[str, Any]:
             prepared = take_steps(steps, begin(distinct))
             canonical = prepared.scene
             changes = prepared.changes
-    agreement, doubt = confirm_depths(canonical), unlike_captures(canonical.gaussians)
+    agreement = confirm_depths(canonical)
+    doubt = unlike_captures(canonical.gaussians)
     doubts = doubt and Doubt(doubt), agreement.advice if agreement else None
     notes = [*load.notes, *views_notes(scene), *record.notes, *changes, *doubts]
     facts: dict[str, Any] = {
@@ -194,7 +197,8 @@ def _describe_scene(load: Loaded, *, is_result: bool) -> dict[str, Any]:
         facts["auto"] = {"share": agreement.share, "num_gaussians": count, "why": describe_share(agreement)[1]}
     if len(scene) > 0:
         # How well colours fit the photos, and in how many photos there is sky
-        gaussians, images = scene.gaussians, photo_array(scene.images)
+        gaussians = scene.gaussians
+        images = photo_array(scene.images)
         sight = check_cameras(gaussians, np.ones(len(gaussians), bool), scene.cameras, images)
         means = gaussians.means[np.isfinite(gaussians.means).all(1)]
         facts |= {"sight": asdict(sight), "num_sky_views": len(sky_regions(means, scene.cameras, images))}
@@ -282,7 +286,8 @@ def _candidate_lines(candidates: Sequence[Mapping[str, Any]]) -> list[str]:
 
 def _alignment_lines(scene: Mapping[str, Any]) -> list[str]:
     """Describe the order of the rows and the distances of Gaussians from their pixels, or say why these are unknown."""
-    alignment, problem = scene["alignment"], scene["alignment_problem"]
+    alignment = scene["alignment"]
+    problem = scene["alignment_problem"]
     if problem is not None and scene["compact"] is None:
         return []  # the command ends with this problem as its error
     if problem is not None:
@@ -301,7 +306,8 @@ def _alignment_lines(scene: Mapping[str, Any]) -> list[str]:
 
 def _coverage_lines(scene: Mapping[str, Any]) -> list[str]:
     """Describe what share of the pixels or of the Gaussians each view shows, and name the view with the least share."""
-    views, sight = scene["coverage"], scene["sight"]
+    views = scene["coverage"]
+    sight = scene["sight"]
     if not views or sight is None:
         return []
     colors = ""
@@ -310,7 +316,8 @@ def _coverage_lines(scene: Mapping[str, Any]) -> list[str]:
     has_pixels = views[0]["share_of_pixels"] is not None
     key, unit = ("share_of_pixels", "pixels") if has_pixels else ("share_of_gaussians", "Gaussians")
     shares = [view[key] for view in views]
-    low, high = f"{100 * min(shares):.0f}", f"{100 * max(shares):.0f}"
+    low = f"{100 * min(shares):.0f}"
+    high = f"{100 * max(shares):.0f}"
     range_text = f"{high} % of the {unit} in every view"
     if low != high:
         range_text = f"{low} to {high} % of the {unit} per view, least in {views[shares.index(min(shares))]['name']}"

@@ -129,7 +129,8 @@ def compact_tensors(
         columns["sh0"] = rgb_to_sh0(rgb)[:, None]
     columns["shN"] = _copy_harmonics(shN, len(columns["means"]))
     gaussians, valid, notes = _check_gaussians(columns)
-    cameras, photos = NO_CAMERAS, None
+    cameras = NO_CAMERAS
+    photos = None
     if order != "none" or viewmats is not None or images is not None:
         cameras, photos = _check_cameras_and_images(viewmats, Ks, images, shape)
     scene, scene_notes = _combine(gaussians, valid, cameras, photos, names, order)
@@ -218,10 +219,13 @@ def _check_gaussians(columns: dict[str, np.ndarray]) -> tuple[Gaussians, np.ndar
     columns_and_mask = columns | {"valid": valid}
     num_bad = clear_invalid("means", columns_and_mask)
     check_values(columns)
-    quats, opacities = columns["quats"], columns["opacities"]
+    quats = columns["quats"]
+    opacities = columns["opacities"]
     lengths = np.linalg.norm(quats[valid], axis=1)
     # If many lengths differ from 1, the quats may have another meaning
-    max_difference, max_share = 0.01, 0.01  # at most this share of the lengths may differ from 1 by more than this
+    # at most this share of the lengths may differ from 1 by more than this
+    max_difference = 0.01
+    max_share = 0.01
     share = float((np.abs(lengths - 1) > max_difference).mean())
     if share > max_share:
         sizes = f"{100 * share:.3g} % with lengths of {lengths.min():.3g} to {lengths.max():.3g}"
@@ -257,7 +261,8 @@ def _expect_unit_range(name: str, values: np.ndarray, slack: float) -> None:
 
     If the colours look like 0 to 255 or -1 to 1, the error says how to convert them.
     """
-    low, high = float(values.min(initial=0)), float(values.max(initial=0))
+    low = float(values.min(initial=0))
+    high = float(values.max(initial=0))
     if -slack <= low and high <= 1 + slack:
         return
     remedy = ""

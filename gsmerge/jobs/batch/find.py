@@ -95,7 +95,8 @@ def find_named_scenes(arguments: Sequence[str], out: Path, lookalikes: list[str]
     """
     skip = os.path.realpath(out)
     for argument in arguments:
-        path, search = Path(argument), _Search(skip, [] if lookalikes is None else lookalikes)
+        path = Path(argument)
+        search = _Search(skip, [] if lookalikes is None else lookalikes)
         if path.is_dir():
             if os.path.realpath(path) == skip:
                 raise UsageError(
@@ -152,7 +153,9 @@ class _Search:
         for path, subfolders, files in (entry for start in starts for entry in os.walk(start, onerror=errors.append)):
             yield from ((Path(error.filename), top) for error in errors)
             errors.clear()
-            folder, names, real_path = Path(path), [*subfolders, *files], os.path.realpath(path)
+            folder = Path(path)
+            names = [*subfolders, *files]
+            real_path = os.path.realpath(path)
             if real_path == self.skip or real_path in self.seen:
                 subfolders.clear()  # os.walk enters none of them
                 continue
@@ -221,7 +224,8 @@ def _is_scene_folder(folder: Path, names: list[str]) -> bool:
 
 def _match_pattern(pattern: str, search: _Search) -> Iterator[NamedScene]:
     """Yield the scenes that match a pattern, and the scenes in folders that match; ``**`` passes through no links."""
-    anchor, named = Path(pattern).anchor, Path(pattern).parts
+    anchor = Path(pattern).anchor
+    named = Path(pattern).parts
     paths = Path(anchor).glob(os.path.relpath(pattern, anchor) if anchor else pattern)
     # Hidden files and folders match only if the pattern has their names
     shown = (str(path) for path in paths if all(part[:1] != "." or part in named for part in path.parts))
@@ -234,7 +238,9 @@ def _match_pattern(pattern: str, search: _Search) -> Iterator[NamedScene]:
 
 def _read_list(file: Path, search: _Search) -> Iterator[NamedScene]:
     """Yield the scenes of a text file with one path per line, relative to its folder, and also missing scenes."""
-    budget, entries = read_budget(file), dict[str, None]()  # a dict keeps each line once, in order
+    # a dict keeps each line once, in order
+    budget = read_budget(file)
+    entries = dict[str, None]()
     job_bytes = 700  # bytes of memory for each scene of a list
     for line in read_lines(file):
         if "\0" in line:

@@ -73,7 +73,8 @@ class BatchOptions(Settings):
             example = ""  # refused below
         is_inside = not example.startswith(("/", "~", ".")) and "\\" not in example and ".." not in example.split("/")
         if not (is_inside and example.lower().endswith(OUTPUT_FORMATS)):
-            placeholders, endings = ", ".join(f"{{{name}}}" for name in FIELDS), ", ".join(OUTPUT_FORMATS)
+            placeholders = ", ".join(f"{{{name}}}" for name in FIELDS)
+            endings = ", ".join(OUTPUT_FORMATS)
             expected = (
                 f"a name inside the output folder, not hidden, that ends in {endings} and has only {placeholders}"
             )

@@ -15,7 +15,9 @@ from gsmerge.io.jsonl import each_line
 from gsmerge.runtime.documents import document_head, file_sha256
 
 RECORDS = "batch.jsonl"
-DONE, FAILED = "done", "failed"  # values of `status` in records
+# values of `status` in records
+DONE = "done"
+FAILED = "failed"
 SKIPPED = "skipped"  # `status` of a result that was done before, which is reported but not recorded again
 
 
@@ -63,7 +65,8 @@ class RecordIndex:
                         {"path": _text(file["path"]), "sha256": file["sha256"], "bytes": file["bytes"]}
                         for file in line["files"]
                     ]
-                    doubts, unmet = tuple(map(_text, line.get("doubts", ()))), _text(line.get("unmet") or "") or None
+                    doubts = tuple(map(_text, line.get("doubts", ())))
+                    unmet = _text(line.get("unmet") or "") or None
                     result = DoneResult(_text(line["key"]), files, _text(line["scene"]), doubts, unmet)
                     self.results[_text(line["output"])] = result
         return self

@@ -64,7 +64,8 @@ def choose_concurrency(jobs: Sequence[Job], options: BatchOptions) -> Concurrenc
     The free memory limits how many scenes run at once, as if every scene had the median size. While scenes larger than
     the median run, fewer scenes run at the same time.
     """
-    threads, processors = options.settings.threads, available_threads()
+    threads = options.settings.threads
+    processors = available_threads()
     if options.engine == "ray":
         return Concurrency(options.jobs or 0, threads or 1)
     free = math.inf if options.jobs else free_memory() or math.inf
@@ -78,7 +79,8 @@ def pending_jobs(jobs: Sequence[Job], folder: Path, options: BatchOptions) -> li
 
     A run takes on the jobs whose results are not done, and with ``overwrite`` all jobs.
     """
-    results, pending = RecordIndex(folder).read_on().results, list[tuple[Job, str | None]]()
+    results = RecordIndex(folder).read_on().results
+    pending = list[tuple[Job, str | None]]()
     for job in jobs:
         known = results.get(job.output)
         try:
@@ -161,7 +163,8 @@ def run_batch(jobs: Sequence[Job], folder: Path, options: BatchOptions) -> Gener
                 yield Call(job, (job, run, wait), job.memory)
 
         # A scene that needs more than its share of the memory makes others wait, so it comes last
-        remaining, wait = sorted(jobs, key=lambda job: job.memory * concurrency.jobs > concurrency.memory), False
+        remaining = sorted(jobs, key=lambda job: job.memory * concurrency.jobs > concurrency.memory)
+        wait = False
         while remaining:
             busy: list[Job] = []
             for job, outcome in pool.run(run_job, make_calls(remaining, wait=wait)):
@@ -171,7 +174,8 @@ def run_batch(jobs: Sequence[Job], folder: Path, options: BatchOptions) -> Gener
                     busy.append(job)
                 else:
                     yield line
-            remaining, wait = busy, True
+            remaining = busy
+            wait = True
 
 
 def run_job(job: Job, run: Run, wait: bool, lost: str | None = None) -> dict[str, Any] | None:
@@ -199,7 +203,8 @@ def run_job(job: Job, run: Run, wait: bool, lost: str | None = None) -> dict[str
 def _make_result(job: Job, run: Run, mark: Path) -> dict[str, Any]:
     """Make a result, unless it is done or refused, and return its record. The caller has locked the result."""
     files = job.find_files()
-    key, known = job.call.key(files), read_run_index(run.folder).read_on().results.get(job.output)
+    key = job.call.key(files)
+    known = read_run_index(run.folder).read_on().results.get(job.output)
     if known is not None and not run.overwrite and known.holds(run.folder, key):
         return record(
             SKIPPED, job.scene, job.output, key=key, files=known.files, doubts=known.doubts, unmet=known.unmet

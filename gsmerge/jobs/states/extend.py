@@ -31,7 +31,10 @@ from gsmerge.types import Cameras, Gaussians, Scene
 # So the worlds differ if the quotient is above WORLD_RATIO. If the quotient is so near WORLD_RATIO that chance may
 # decide, the comparison has no result.
 WORLD_RATIO = 0.9
-SAME_WORLD, ANOTHER_WORLD, UNKNOWN_WORLD = "the same", "another", "not known"  # results of comparing two worlds
+# results of comparing two worlds
+SAME_WORLD = "the same"
+ANOTHER_WORLD = "another"
+UNKNOWN_WORLD = "not known"
 BATCH = "batch"  # path in an error about a batch, until the caller puts in the path of its file
 NOT_COMPARED = (
     "the pictures of this batch show too little of the earlier Gaussians to say whether both are in the same world"
@@ -82,7 +85,8 @@ def extend(
     with use_threads(options.threads), record_run(progress):
         prepared, plan = plan_run(scene, options)
         batch_views = _keep_pictures(prepared)
-        world, parts = UNKNOWN_WORLD, []
+        world = UNKNOWN_WORLD
+        parts = []
         if before is not None:
             world = compare_worlds(before.gaussians, batch_views, prepared.input_scene.gaussians.means)
             refuse_other_world(world, extend_options)
@@ -121,7 +125,8 @@ def compare_worlds(before: Gaussians, views: Scene, means: np.ndarray) -> str:
     """
     if not len(views):
         return UNKNOWN_WORLD
-    is_finite, hiding = np.isfinite(np.asarray(before.means)).all(1), means[np.isfinite(means).all(1)]
+    is_finite = np.isfinite(np.asarray(before.means)).all(1)
+    hiding = means[np.isfinite(means).all(1)]
     pictures = photo_array(views.images)
     sample_gaussians = 10_000  # earlier Gaussians that are compared with new views
     check = check_cameras(before, is_finite, views.cameras, pictures, sample_gaussians, foremost=True, hiding=hiding)
@@ -140,14 +145,16 @@ def refuse_other_world(world: str, options: ExtendOptions) -> None:
 
 def _keep_pictures(prepared: Prepared) -> Scene:
     """Return a scene without Gaussians, which has each view of the input once, with the picture for its fit."""
-    input_scene, no_gaussians = prepared.input_scene, prepared.input_scene.gaussians[:0]
+    input_scene = prepared.input_scene
+    no_gaussians = prepared.input_scene.gaussians[:0]
     if prepared.reference.placed:  # the input has no views
         return Scene(no_gaussians, input_scene.cameras, None, None, input_scene.names)
     # A view may have several layers of Gaussians, each with the same camera, and only the first layer is kept
     first_layers = np.unique(camera_kinds(input_scene.cameras), return_index=True)[1]
     views = sorted(first_layers.tolist())
     kept = [prepared.repeated[view] for view in views]
-    images, masks = prepared.scene.images[kept], prepared.scene.masks
+    images = prepared.scene.images[kept]
+    masks = prepared.scene.masks
     masks = None if masks is None else masks[kept]
     cameras = in_float64(input_scene.cameras[views])
     return Scene(no_gaussians, cameras, images, None, tuple(input_scene.names[view] for view in views), masks=masks)
@@ -163,7 +170,9 @@ def _join_views(before: Scene, batch: Scene) -> Scene:
     size = before.cameras.width, before.cameras.height
     assert before.images is not None
     assert batch.images is not None
-    images, cameras, counts = batch.images, batch.cameras, counting_pixels(batch)
+    images = batch.images
+    cameras = batch.cameras
+    counts = counting_pixels(batch)
     if images.shape[2:0:-1] != size:
         images = shrink_pictures(images, *size)
         cameras = resize_cameras(cameras, *size)

@@ -118,10 +118,12 @@ class _JoinContext(NetworkContext):
 
     def summarise_parts(self, features: FeatureGaussians) -> tuple[np.ndarray, np.ndarray]:
         """Return the view ``[g]`` with most of each Feature Gaussian's weight, and its number of members ``[g]``."""
-        num_views, rows = len(self.cameras), features.members
+        num_views = len(self.cameras)
+        rows = features.members
         owners = np.repeat(np.arange(len(features)), np.diff(features.starts))  # the Feature Gaussian of each part
         pairs, pair_ids = np.unique(owners * num_views + self.part_views[rows], return_inverse=True)
-        pair_owners, pair_weights = pairs // num_views, np.bincount(pair_ids, self.part_weights[rows])
+        pair_owners = pairs // num_views
+        pair_weights = np.bincount(pair_ids, self.part_weights[rows])
         order = np.lexsort((pairs, -pair_weights, pair_owners))  # by owner, the heaviest view first
         _, heaviest = np.unique(pair_owners[order], return_index=True)
         num_members = np.bincount(owners, self.part_members[rows], len(features))
@@ -142,7 +144,9 @@ def extend_features(
     with use_threads(options.threads), record_run(progress) as record:
         frame = None if state is None else state.frame
         prepared = prepare(scene.numpy(), options.prepare, frame, steps=without("outside"))  # other batches see more
-        prepared_scene, world, checkpoint = prepared.scene, UNKNOWN_WORLD, None
+        prepared_scene = prepared.scene
+        world = UNKNOWN_WORLD
+        checkpoint = None
         if state is not None:
             world = compare_worlds(feature_to_gaussians(state.refined), prepared_scene, prepared_scene.gaussians.means)
             refuse_other_world(world, extend_options)
@@ -168,7 +172,8 @@ def extend_features(
             saliency = group_saliency(merged, members, pixel_saliency)
             extended = _refine_groups(merged, context, saliency, samples, prepared.frame)
         else:
-            degree, expected = scene.gaussians.sh_degree, NUM_HIGHER.index(state.merged.shN.shape[1])
+            degree = scene.gaussians.sh_degree
+            expected = NUM_HIGHER.index(state.merged.shN.shape[1])
             if degree != expected:
                 raise UsageError(f"expected harmonics of degree {expected}, as in the state, got {degree}")
             saliency = group_saliency(features, members, pixel_saliency)
@@ -214,7 +219,8 @@ def sample_fronts(members: Members, cameras: Cameras, state: FeatureState | None
     pixels = (rows[:, None] * cameras.width + columns).reshape(-1)
     pixel_ids = (np.arange(len(cameras))[:, None] * (cameras.width * cameras.height) + pixels).reshape(-1)
     ids = members.fronts.reshape(-1)[pixel_ids]  # rows of the foremost Gaussians, -1 for none
-    means, sh0 = members.means[ids], members.sh0[ids, 0]
+    means = members.means[ids]
+    sh0 = members.sh0[ids, 0]
     usable = (ids >= 0) & np.isfinite(means).all(1) & np.isfinite(sh0).all(1) & np.isfinite(members.opacities[ids])
     grid = len(cameras), height, width
     return ViewSamples(
@@ -272,7 +278,8 @@ def _join_batch(
     # way each part of the state is compared with its nearest neighbours in the batch, and vice versa
     is_new = np.arange(len(parts)) >= len(state)
     across = match(replace(parts, views=is_new.astype(np.int64)), options)
-    batch_views, batch_extinctions = np.where(is_new, parts.views, -1), np.where(is_new, parts.extinctions, 0)
+    batch_views = np.where(is_new, parts.views, -1)
+    batch_extinctions = np.where(is_new, parts.extinctions, 0)
     within = match(replace(parts, views=batch_views, extinctions=batch_extinctions), options)
     # Clusters of both matchings are joined if they share a part. All scores are set to 1, which is above the threshold,
     # so that all neighbours are connected

@@ -70,8 +70,10 @@ def extend_file(
         raise UsageError(str(error)) from error
     with nullcontext() if dry_run else lock_state(path):
         start = perf_counter()
-        state, paths = tried or (load_state(path) if os.path.exists(path) else None), list_files(files)
-        batch_hash, mode = content_hash(paths), common_mode(paths)
+        state = tried or (load_state(path) if os.path.exists(path) else None)
+        paths = list_files(files)
+        batch_hash = content_hash(paths)
+        mode = common_mode(paths)
         document = {**document_head(), "input": {"path": str(files.ply), "content": batch_hash}, "dry_run": dry_run}
         batches = [] if state is None else state.about["batches"]
         known_hashes = [batch.get("content", batch.get("sha256")) for batch in batches]  # "sha256" before version 0.6
@@ -125,7 +127,8 @@ def _state_facts(path: Path, state: State) -> dict[str, Any]:
 
 def batch_line(document: Mapping[str, Any]) -> str:
     """Summarise the report of :func:`extend_file` in one line."""
-    state, would = document["state"], "would be " if document["dry_run"] else ""
+    state = document["state"]
+    would = "would be " if document["dry_run"] else ""
     if document["repeated"]:
         return f"{state['path']}: {would}unchanged, {count_words(state['num_batches'], 'batch')}"
     size = f", {human_bytes(state['bytes'])}; {seconds_line(document)}"
@@ -150,8 +153,11 @@ def decode_file(
     The output ``out`` has the cameras inside or beside it. With ``dry_run`` nothing is written. Raises SceneError if a
     file cannot be read or written, and UsageError for a K that the networks do not make.
     """
-    start, out, state = perf_counter(), outputs.result, load_state(path)
-    features, batches = state.features, state.about["batches"]
+    start = perf_counter()
+    out = outputs.result
+    state = load_state(path)
+    features = state.features
+    batches = state.about["batches"]
     if features is None:
         raise SceneError(path, "expected Feature Gaussians, found results", "compact it as a scene")
     num_input = sum(int(batch.get("num_input", 0)) for batch in batches)
@@ -162,7 +168,8 @@ def decode_file(
         output = {"path": str(out), "num_gaussians_at_most": max_count}
         return document | {"dry_run": True, "output": output, **note_entries([])}
     read_end = perf_counter()
-    gaussians, decode_end = decode_features(features, options), perf_counter()
+    gaussians = decode_features(features, options)
+    decode_end = perf_counter()
     if len(gaussians) == 0:
         raise SceneError(path, "expected visible Gaussians, found none", "begin a new state with the scene")
     cameras = features.frame.leave_cameras(features.cameras)
@@ -181,7 +188,8 @@ def decode_file(
 
 def decoding_line(document: Mapping[str, Any]) -> str:
     """Summarise the report of :func:`decode_file` in one line."""
-    before, after = document["input"], document["output"]
+    before = document["input"]
+    after = document["output"]
     if "dry_run" in document:
         return f"would write  {after['path']}: at most {after['num_gaussians_at_most']:,} Gaussians"
     return (

@@ -64,7 +64,8 @@ def save_state(path: StrPath, state: State, *, overwrite: bool = False, mode: in
     arrays |= {name: getattr(features, name) for name in ("views", "num_members", "saliency", "group")}
     arrays |= {f"samples.{name}": column for name, column in vars(features.samples).items()}
     arrays |= {f"networks.{name}": array for name, array in features.networks.arrays.items()}
-    cameras, frame = features.cameras, features.frame
+    cameras = features.cameras
+    frame = features.frame
     arrays |= {"viewmats": cameras.viewmats, "Ks": cameras.Ks, "merged.views": features.merged.views}
     arrays["origin"] = frame.origin
     header = {"kind": FEATURES, "width": cameras.width, "height": cameras.height, "unit": frame.unit}
@@ -100,7 +101,8 @@ def holds_features(path: Path) -> bool:
 
 def _read_features(file: GsmFile) -> FeatureState:
     """Read Feature Gaussians, and check type, shape and range of every array."""
-    prefix, options = "networks.", file.header.get("networks")
+    prefix = "networks."
+    options = file.header.get("networks")
     if not isinstance(options, dict):
         raise file.error(f"expected networks in the header, found {options!r:.40}")
     stored_networks = {name.removeprefix(prefix): a for name, a in file.arrays.items() if name.startswith(prefix)}
@@ -112,7 +114,8 @@ def _read_features(file: GsmFile) -> FeatureState:
     for view, (viewmat, K) in enumerate(zip(cameras.viewmats, cameras.Ks, strict=True)):
         check_camera(file.path, str(view), viewmat, K)
         check_size(file.path, str(view), K, (cameras.width, cameras.height))
-    g, num_views = len(file.array("views", np.int64, None)), len(cameras)
+    g = len(file.array("views", np.int64, None))
+    num_views = len(cameras)
     num_higher = file.array("merged.shN", np.float32, g, None, 3).shape[1]
     if num_higher not in NUM_HIGHER:
         raise file.error(f"merged.shN: expected {NUM_HIGHER} harmonics, found {num_higher}")
