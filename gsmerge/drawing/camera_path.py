@@ -31,7 +31,8 @@ ORBIT_PIECES = 6 * CURVE_PIECES  # straight pieces of a whole orbit
 # Least and largest extent of an orbit, to each side and upwards, as shares of the distance to its centre. With the
 # least extent, a scene of a single photo shows few of its gaps. The largest extent turns the view by 14 degrees to each
 # side
-HORIZONTAL, VERTICAL = (0.06, 0.25), (0.03, 0.125)
+HORIZONTAL = (0.06, 0.25)
+VERTICAL = (0.03, 0.125)
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,9 @@ def parse_camera_path(text: str) -> CameraPath | None:
     if match is None:
         form = f"{kind}{'[:DEGREES]' if kind == 'orbit' else ''}[,back:SHARE]"
         raise ValueError(f"path: expected {form}, got {text}")
-    max_turn, max_back = 90.0, 10.0  # largest degrees to each side, and largest share of the depth
+    # largest degrees to each side, and largest share of the depth
+    max_turn = 90.0
+    max_back = 10.0
     turn = _parse_number(match["turn"], "orbit: expected degrees", max_turn)
     back = _parse_number(match["back"], "back: expected a share of the depth", max_back)
     return CameraPath(kind, turn, back or 0.0)
@@ -117,7 +120,8 @@ def outside_camera(cameras: Cameras, means: np.ndarray) -> tuple[Cameras, float]
     point, in world units. The fog of a result is also measured from outside cameras, see :mod:`gsmerge.scoring.fog`.
     """
     back, turn = FOG_CAMERAS["turned"][-1]
-    middle, depth = cameras[[median_camera(cameras)]], viewing_depth(cameras, means)
+    middle = cameras[[median_camera(cameras)]]
+    depth = viewing_depth(cameras, means)
     viewmat = step_outside(middle.viewmats[0], depth, back, turn)
     return replace(middle, viewmats=viewmat[None]), (1 + back) * depth
 
@@ -173,7 +177,9 @@ def spline(cameras: Cameras, depth: float, count: int) -> Cameras:
     steps = _lengths(np.diff(poses, axis=0))
     tolerance = 1e-9  # poses count as equal up to this distance, as a share of a path's length
     is_new = np.concatenate([[True], steps > tolerance * max(steps.sum(), depth)])  # a pose differs from the one before
-    origin, poses, Ks = poses[0, :3].copy(), poses[is_new], cameras.Ks[is_new].astype(np.float64)
+    origin = poses[0, :3].copy()
+    poses = poses[is_new]
+    Ks = cameras.Ks[is_new].astype(np.float64)
     if len(poses) < 2:
         raise ValueError("spline: expected at least 2 different cameras, got 1; use an orbit, which needs one")
     poses[:, :3] -= origin

@@ -55,7 +55,9 @@ class Caption:
         height, width = self.text.shape[:2]
         box = picture[self.top : self.top + height, self.left : self.left + width]
         text = self.text[: box.shape[0], : box.shape[1]]  # the part inside a tiny frame
-        shade, text_level = 0.35, 245  # brightness of the picture behind a caption, and level of its text
+        # brightness of the picture behind a caption, and level of its text
+        shade = 0.35
+        text_level = 245
         box[:] = (shade * box * (1 - text) + text_level * text).round()
 
 
@@ -68,7 +70,8 @@ def make_captions(texts: Sequence[tuple[str, str, str]], width: int, height: int
     """
     scale, thickness = max(0.45, height / 900), max(1, round(height / 600))
     line_height = round(LINE * scale)
-    margin, max_width = line_height // 2, width // len(texts) - 2 * line_height
+    margin = line_height // 2
+    max_width = width // len(texts) - 2 * line_height
 
     def text_width(text: str) -> int:
         """Return the width of a text at the present ``scale``, in pixels."""
@@ -109,7 +112,8 @@ def swipe_borders(count: int, frames: int, fps: float, width: int) -> list[list[
     swipe_share = 0.9  # a border moves by this share of its distance from the next one
     shifts = swipe_share * sin(2 * np.pi * rounds * np.arange(frames) / frames)
     borders = (np.arange(count + 1) + shifts[:, None]) * width / count
-    borders[:, 0], borders[:, -1] = 0, width
+    borders[:, 0] = 0
+    borders[:, -1] = width
     return [list(map(int, row)) for row in borders.round()]
 
 

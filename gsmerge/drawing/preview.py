@@ -24,7 +24,8 @@ FACE = cv2.FONT_HERSHEY_SIMPLEX
 MAX_SIDES = {".webp": 16383, ".jpg": 65500, ".jpeg": 65500}  # largest side that a format or its encoder takes, pixels
 # Height of the label above a picture that is narrower than twice LABEL_WIDTH, pixels. For wider pictures this height is
 # multiplied by a whole number
-LABEL_HEIGHT, LABEL_WIDTH = 22, 640
+LABEL_HEIGHT = 22
+LABEL_WIDTH = 640
 LABEL_LEVEL = 32  # grey level of labels, and of cells without a photo
 GAP_PIXELS = 4  # pixels between pictures
 CHEQUER_LEVELS = 0.4, 0.6  # of the squares of a chequered ground
@@ -58,7 +59,8 @@ def save_picture(path: Path, picture: BytePicture, *, overwrite: bool = True) ->
 
     SceneError if a side is too long for the format.
     """
-    max_side, (height, width) = MAX_SIDES.get(path.suffix.lower(), math.inf), picture.shape[:2]
+    max_side = MAX_SIDES.get(path.suffix.lower(), math.inf)
+    height, width = picture.shape[:2]
     if max(height, width) > max_side:
         problem = f"expected at most {max_side:,} pixels per side of a {path.suffix}, got {width} x {height}"
         raise SceneError(path, problem, "name a .png, or lower --size")
@@ -137,7 +139,8 @@ def view_pictures(
             mask = covered if background is None and 0 < covered.mean() < WHOLE_SHARE else None
             name += "" if mask is None else ", where the scene is"
             if masks is not None and photo is not None and not masks[row].all():
-                mask, name = masks[row], "the photo, where it counts"
+                mask = masks[row]
+                name = "the photo, where it counts"
             columns[1:] = [(f"{text}, {psnr_words(psnr(im, reference, mask))} to {name}", im) for text, im in compared]
         if background is None:
             shown = [lay_on_chequer(one.images[row], 1 - one.alphas[row, ..., 0]) for one in drawn]

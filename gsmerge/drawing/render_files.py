@@ -57,7 +57,9 @@ from gsmerge.types import Cameras, Gaussians, StrPath
 
 SECONDS = 4  # least duration of a clip
 VIEW_FRAMES = 4  # least number of frames for each view of a spline
-FPS, GIF_FPS = 30.0, 12.5  # frames per second
+# frames per second
+FPS = 30.0
+GIF_FPS = 12.5
 GIF_SIDE = 640  # largest side of a GIF if the option size is not given, pixels
 PLACED_SIZE = 1280, 720  # width and height of pictures from placed cameras, pixels
 
@@ -178,7 +180,9 @@ def prepare_panel(options: DrawOptions) -> Drawing:
     """
     group = _read_scenes(options, photos=True)
     scene = group.load.scene
-    cameras, photos, pictured = options.resize(scene.cameras), scene.images, scene.photo_views
+    cameras = options.resize(scene.cameras)
+    photos = scene.images
+    pictured = scene.photo_views
     panel_views = 4  # rows of a panel
     ids = options.choose(scene.names, panel_views)
     names = [re.split(r"[\\/]", scene.names[i])[-1] for i in ids]
@@ -189,7 +193,8 @@ def prepare_panel(options: DrawOptions) -> Drawing:
         shown = None if photos is None else [photos[i] if i in pictured else None for i in ids]
         if shown and options.size:
             shown = [None if photo is None else fill_photo(photo, *options.size) for photo in shown]
-        marks, masks = [info.antialiased for info in group.infos], None
+        marks = [info.antialiased for info in group.infos]
+        masks = None
         if shown and not options.size:
             counts = scored_pictures(scene)[0].masks  # of an object before one colour, the object counts
             masks = None if counts is None else [counts[i] for i in ids]
@@ -312,7 +317,9 @@ def _read_scenes(options: DrawOptions, *, photos: bool) -> DrawnScenes:
     If ``photos``, also read the photos of these cameras.
     If there are no cameras, views are placed around the scene, and if ``photos`` also inside it.
     """
-    files, framing, paths = options.files, options.framing, options.paths
+    files = options.files
+    framing = options.framing
+    paths = options.paths
     first_ply = read_gaussian_file(files, opacity=options.opacity, hints=options.hints)
     hints: dict[str, Any] = {"scales": options.hints.scales, "colors": options.hints.colors}
     plys = [read_gaussians(path, opacity=options.opacity, **hints) for path in paths[1:]]
@@ -338,7 +345,8 @@ def find_view(view: str, names: Sequence[str]) -> int:
 
     Raises UsageError if no view or several views have the name.
     """
-    stems, number = picture_stems(names), picture_stems([view])[0].lstrip("0")
+    stems = picture_stems(names)
+    number = picture_stems([view])[0].lstrip("0")
     ids = [i for i, name in enumerate(names) if view in (name, Path(name).name, stems[i])]
     ids = ids or [i for i, stem in enumerate(stems) if stem.lstrip("0") == number]
     if len(ids) != 1:
@@ -398,5 +406,6 @@ def drawing_line(document: Mapping[str, Any]) -> str:
         is_less_played = document["encoding"] != H264[0] and document["pictures"][0].lower().endswith(".mp4")
         hint = ", which not all programs play; with ffmpeg on the PATH it would be H.264" if is_less_played else ""
         return f"{line}, {document['encoding']}{hint}"
-    count, views = len(document["pictures"]), len(document["views"])
+    count = len(document["pictures"])
+    views = len(document["views"])
     return f"{count} picture{'' if count == 1 else 's'} of {views} view{'' if views == 1 else 's'}"

@@ -160,7 +160,9 @@ def collect_page_data(
             title, scene, results, file_bytes, held_out, evaluation, stills, light=light, cut_out=bool(cut_out)
         )
     progress("done", 0, 0)
-    gains, sides, notes = new_gains or {}, [], list[str]()
+    gains = new_gains or {}
+    sides = []
+    notes = list[str]()
     for side in data.sides:
         gain = gains.get(side.name)
         if gain is not None and not data.held_out and is_worse(data.sides[0].mean.psnr, side.mean.psnr):
@@ -285,7 +287,8 @@ def _collect_side(
     if result.name != INPUT:
         splats, sh_degree = pack_splats(gaussians)
     elif light:  # the page shows the scene itself in pictures only
-        splats, sh_degree = None, file_sh_degree
+        splats = None
+        sh_degree = file_sh_degree
     else:
         homes = None
         if scene.has_own_pixels:

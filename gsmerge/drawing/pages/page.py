@@ -108,8 +108,10 @@ def headline(data: ViewData, side_id: int = 1) -> str:
         quality = before.mean.psnr
         has_quality = quality is not None and np.isfinite(quality)
         return f"{before.num_gaussians:,} Gaussians" + (f", {quality:.1f} dB" if has_quality else "")
-    after, reference = data.sides[side_id], PHOTOS if data.held_out else data.reference
-    old, new = before.mean.psnr, after.mean.psnr
+    after = data.sides[side_id]
+    reference = PHOTOS if data.held_out else data.reference
+    old = before.mean.psnr
+    new = after.mean.psnr
     share = after.num_gaussians / max(before.num_gaussians, 1)
     share_text = f"{human_share(share, 1 if share >= 0.01 else 2)} of the Gaussians"
     if after.new_gain is not None and not data.held_out:
@@ -174,7 +176,8 @@ class Figure:
 
 def list_figures(data: ViewData, side_id: int) -> list[Figure]:
     """List the figures at the top of the page for one side: its size, expected gain, and mean quality."""
-    before, after = data.sides[0], data.sides[side_id]
+    before = data.sides[0]
+    after = data.sides[side_id]
     figures = [
         Figure("Gaussians", f"{before.num_gaussians:,}", f"{after.num_gaussians:,}", ""),
         Figure("File", human_bytes(before.file_bytes), human_bytes(after.file_bytes), ""),
@@ -189,7 +192,8 @@ def list_figures(data: ViewData, side_id: int) -> list[Figure]:
     scores = []
     for label, name, old_quality, new_quality in qualities:
         if any(getattr(side.mean, name) is not None for side in data.sides[1:] or data.sides):
-            old, new = getattr(old_quality, name), getattr(new_quality, name)
+            old = getattr(old_quality, name)
+            new = getattr(new_quality, name)
             digits, unit = (2, " dB") if name == "psnr" else (3, "")
             is_better = side_id > 0 and old is not None and new is not None and old < new
             mark = "own" if own else "up" if is_better else ""

@@ -20,8 +20,11 @@ MAX_SPZ_BYTES = 40_000_000  # before compression; enough for 2 million Gaussians
 COARSE_COUNT = 300_000  # larger scenes have Gaussians as small as pixels, which may be less exact
 # Step sizes of opacity, colour and logarithm of the scale, in steps of a .spz, and the number of steps of a rotation
 # from 0 to half a turn. With COARSE, pictures have a PSNR of 50 dB against pictures of the exact scene
-EXACT, COARSE = ((1, 1, 1), 255), ((16, 2, 2), 31)
-PIXEL_PARTS, DEPTH_PARTS = 8, 1024  # steps per pixel of a shift within it, and steps per unit of a logarithm of depth
+EXACT = ((1, 1, 1), 255)
+COARSE = ((16, 2, 2), 31)
+# steps per pixel of a shift within it, and steps per unit of a logarithm of depth
+PIXEL_PARTS = 8
+DEPTH_PARTS = 1024
 
 
 def pack_splats(
@@ -41,7 +44,8 @@ def pack_splats(
     ``cameras`` are in the page's frame. The scene has a size of about 1 in this frame, since browsers keep means in 16
     bits.
     """
-    rows, means = drawn_rows(gaussians), np.ascontiguousarray(gaussians.means, np.float32)
+    rows = drawn_rows(gaussians)
+    means = np.ascontiguousarray(gaussians.means, np.float32)
     count = len(rows)
     if count > MAX_GAUSSIANS:
         return None, 0
@@ -77,7 +81,9 @@ def pack_splats(
     arrays = (gaussians.opacities, gaussians.sh0, gaussians.scales, gaussians.quats, gaussians.shN)
     columns = (np.ascontiguousarray(array.reshape(len(array), prod(array.shape[1:])), np.float32) for array in arrays)
     pack_looks(rows, *columns, SH_C0, spz.COLOR_SCALE, np.array(steps, np.int32), levels, looks)  # fills looks
-    column_bytes, planes = list[int](), list[bytes]()  # bytes per number of each column, and the columns
+    # bytes per number of each column, and the columns
+    column_bytes = list[int]()
+    planes = list[bytes]()
     for column in (*positions, *looks):
         num_bytes = max(1, -(-int(column.max(initial=0)).bit_length() // 8))
         column_bytes.append(num_bytes)
