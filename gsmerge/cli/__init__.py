@@ -19,7 +19,8 @@ INTERRUPTED = 130  # exit code
 # the system when the array is deleted. The process keeps up to 256 MiB of the memory of deleted smaller arrays for new
 # arrays. With glibc's default values, the system clears new pages for each array: `view` then has 2.3 times the page
 # faults, at the same peak of memory
-M_MMAP_THRESHOLD, M_TRIM_THRESHOLD = (-3, 1 << 25), (-1, 1 << 28)
+M_MMAP_THRESHOLD = (-3, 1 << 25)
+M_TRIM_THRESHOLD = (-1, 1 << 28)
 
 
 def main(args: Sequence[str] | None = None) -> int:

@@ -106,7 +106,8 @@ def _run(
     from gsmerge.jobs.batch.records import FAILED, SKIPPED
     from gsmerge.jobs.batch.run import choose_concurrency
 
-    totals, silent = Totals(len(jobs)), quiet or as_json
+    totals = Totals(len(jobs))
+    silent = quiet or as_json
     say(f"{count_words(len(jobs), 'scene')}, {choose_concurrency(jobs, options)}", quiet=silent)
     stdout = sys.stdout
     try:
@@ -119,7 +120,9 @@ def _run(
                 totals.add(record)
                 if as_json:
                     print(json.dumps(record, separators=(",", ":")), file=stdout, flush=True)
-                failure, num_skipped, num_failed = record["error"] or "", totals.counts[SKIPPED], totals.counts[FAILED]
+                failure = record["error"] or ""
+                num_skipped = totals.counts[SKIPPED]
+                num_failed = totals.counts[FAILED]
                 # skipped scenes take no time, so the time left is estimated without them
                 share = 1.0 if num_ended == len(jobs) else (num_ended - num_skipped) / (len(jobs) - num_skipped)
                 report = record["report"]  # None for a failure, and for a result that was done before
@@ -130,7 +133,8 @@ def _run(
             print_document(
                 {}, [*totals.lines(terminal_columns(sys.stdout)), *map("note: {}".format, notes)], as_json=False
             )
-    doubtful, results = totals.reasons["doubt"], count_words(totals.total - len(totals.reasons["error"]), "result")
+    doubtful = totals.reasons["doubt"]
+    results = count_words(totals.total - len(totals.reasons["error"]), "result")
     problem = (
         f"{len(doubtful)} of {results} {'is' if len(doubtful) == 1 else 'are'} doubtful"
         f"{_first_reason(doubtful, listed=not silent)}"
@@ -206,9 +210,11 @@ class Totals:
         if fidelity := report["choices"].get("fidelity"):
             # without photos the result is compared with the input
             quality = ["the input", "equal" if fidelity["psnr"] >= MAX_PSNR else f"{fidelity['psnr']:.2f}"]
-        counts, new = [f"{report[name]['num_gaussians']:,}" for name in ("output", "input")], report["new_views"]
+        counts = [f"{report[name]['num_gaussians']:,}" for name in ("output", "input")]
+        new = report["new_views"]
         gain = "" if new is None else f"about {new['after'] - new['before']:+.1f} dB"
-        share, seconds = human_share(report["ratio"]), f"{report['total_seconds']:.1f}"
+        share = human_share(report["ratio"])
+        seconds = f"{report['total_seconds']:.1f}"
         self.rows.append((record["output"], *counts, share, gain, *quality, seconds))
 
     def lines(self, columns: int | None = None) -> list[str]:

@@ -109,10 +109,12 @@ def own_cameras(paths: Sequence[Path], scene: Scene) -> tuple[dict[str, Cameras]
     from gsmerge.reading.scene_files import result_cameras
 
     cameras: dict[str, Cameras] = {}
-    notes, start = list[str](), scene.cameras.viewmats
+    notes = list[str]()
+    start = scene.cameras.viewmats
     tolerance = 1e-5  # difference, absolute and relative, that writing and reading a pose may cause
     for name, path in zip(file_names(paths), paths, strict=True):
-        camera_path, camera_file = result_cameras(path), None
+        camera_path = result_cameras(path)
+        camera_file = None
         if camera_path is not None and scene.is_shown:
             with suppress(SceneError):  # a damaged camera file does not prevent measuring
                 camera_file = read_cameras(camera_path)

@@ -215,14 +215,17 @@ def _print_result(document: Mapping[str, Any], run: Run) -> None:
 
     notes = split_notes(document["notes"], "worse")[1]  # that it is worse is printed after the report
     say_notes([note for note in notes if not (run.strict and isinstance(note, Doubt))], quiet=run.silent)
-    columns, next_step = terminal_columns(sys.stdout), None
+    columns = terminal_columns(sys.stdout)
+    next_step = None
     if columns is not None and not run.has_page and run.out.suffix.lower() in VIEWED:
         # ./ before a path that begins with a dash shows that the path is not an option
         paths = [f"./{path}" if str(path)[0] == "-" else str(path) for path in (run.scene, run.out)]
         next_step = shlex.join(["gsmerge", "view", *paths])
     lines = result_table(document, next_step, columns=columns)
     print_document(document, lines, as_json=run.json, quiet=run.quiet, wrap=False)
-    psnr, worse, keeps_fidelity = document["psnr_input_views"], document["worse"], "fidelity" in document["choices"]
+    psnr = document["psnr_input_views"]
+    worse = document["worse"]
+    keeps_fidelity = "fidelity" in document["choices"]
     if run.strict and not (worse or keeps_fidelity) and psnr["before"] is None:
         say_notes(["--strict: nothing was checked, since there is no photo to compare with"], quiet=run.silent)
     if worse and not run.strict:

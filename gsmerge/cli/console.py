@@ -35,7 +35,8 @@ class JsonLines:
 
     def print(self, event: Mapping[str, Any]) -> None:
         """Print an event with the seconds since the start, the share that is done and the seconds left."""
-        share, left = self.share, self.seconds_left
+        share = self.share
+        left = self.seconds_left
         numbers = {"share": None if share is None else round(share, 3), "seconds": round(self.seconds, 2)}
         numbers["seconds_left"] = None if left is None else round(left, 1)
         with suppress(OSError):
@@ -212,7 +213,8 @@ def stage_progress(*, quiet: bool) -> Iterator[Progress]:
             task = bars.add_task("", total=None)
 
             def move_bar(text: str, done: int, total: int) -> None:
-                share, is_stage = _share_done(text, done, total), ": " not in text
+                share = _share_done(text, done, total)
+                is_stage = ": " not in text
                 total_share = None if share is None else 1.0
                 bars.update(task, description=one_line(text), completed=share, total=total_share, refresh=is_stage)
 

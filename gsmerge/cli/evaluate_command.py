@@ -41,11 +41,14 @@ def evaluate(
     from gsmerge.reading.scene_files import find_scene_files
 
     nets, lpips_notes = lpips_networks(lpips)
-    given, reading, silent = opt.read_settings(SETTINGS, set, lpips=lpips), opt.read_hints(hint), quiet or json
+    given = opt.read_settings(SETTINGS, set, lpips=lpips)
+    reading = opt.read_hints(hint)
+    silent = quiet or json
     options, measuring = given.make(*SETTINGS, lpips=nets)
     if not options.context and targets is None:
         raise UsageError("context=false: expected held-out views to measure instead; name them with --targets")
-    after, outputs = after or [], output or []
+    after = after or []
+    outputs = output or []
     files = find_scene_files(before, cameras=cameras, images=images, masks=masks)
     if quiet and not (outputs or json):
         raise UsageError("--quiet: expected -o or --json with it, since otherwise nothing is shown or written")

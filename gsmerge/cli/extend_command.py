@@ -46,7 +46,9 @@ def extend(
     for files in batches:
         if any(path.resolve() == state.resolve() for path in input_files(files)):
             raise UsageError(f"{state}: expected a state other than the input; name another file")
-    documents, tried = list[dict[str, Any]](), None  # in a dry run, the state that no file holds
+    # in a dry run, the state that no file holds
+    documents = list[dict[str, Any]]()
+    tried = None
     for files in batches:
         before = {"import": perf_counter() - start} if not documents else {}
         with stage_progress(quiet=quiet or json) as on_step:

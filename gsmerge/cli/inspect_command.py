@@ -21,7 +21,9 @@ def inspect(
     from gsmerge.jobs.file_checks import FileCheck, check_content, holds_scene
     from gsmerge.runtime.documents import document_head, note_entries
 
-    path, reading, silent = paths[0], opt.read_hints(hint), quiet or json
+    path = paths[0]
+    reading = opt.read_hints(hint)
+    silent = quiet or json
     if len(paths) == 1 and (holds_scene(path) or path.name == INDEX):  # describe a scene in detail
         from gsmerge.jobs.inspect import inspect as inspect_scene
         from gsmerge.jobs.inspect import inspection_lines
@@ -47,7 +49,8 @@ def inspect(
         for path in paths:
             on_step(f"inspect: {path.name}", len(checks), len(paths))
             checks.append(check_content(path, opacity=reading.opacity, hints=reading.hints))
-    wrong, several = [check for check in checks if check.problems], len(checks) > 1
+    wrong = [check for check in checks if check.problems]
+    several = len(checks) > 1
     notes = [note for check in checks for note in name_notes(check.path, check.notes)]
     say_notes(notes, quiet=silent)
     document = {

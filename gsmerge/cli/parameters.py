@@ -28,9 +28,13 @@ from gsmerge.settings.reading import NONE, FileHints, OpacityChoice, ReadHints
 from gsmerge.settings.setting import Setting, flat_settings, join_words, suggest_name
 from gsmerge.settings.stages import Engine
 
-INPUT, COUNT, METHOD, MEASURING, OUTPUT, RUNNING, GENERAL = (
-    "Input", "How many Gaussians", "Method", "Measuring", "Output", "Running", "General"
-)  # fmt: skip
+INPUT = "Input"
+COUNT = "How many Gaussians"
+METHOD = "Method"
+MEASURING = "Measuring"
+OUTPUT = "Output"
+RUNNING = "Running"
+GENERAL = "General"
 LIST_SETTINGS = "help"  # with this value, --set prints all settings
 SEED_VARIABLE = "GSMERGE_SEED"  # environment variable with the seed for commands without --seed
 if TYPE_CHECKING:
@@ -83,7 +87,8 @@ def read_settings(kinds: Sequence[Kind], pairs: Iterable[str] | None = None, **t
             raise UsageError(f"--set {name}: expected this setting once, got {labels[name]} too")
         typed[name], labels[name] = text, f"--set {name}"
     if "seed" in settings and "seed" not in typed and os.environ.get(SEED_VARIABLE):
-        typed["seed"], labels["seed"] = os.environ[SEED_VARIABLE], SEED_VARIABLE
+        typed["seed"] = os.environ[SEED_VARIABLE]
+        labels["seed"] = SEED_VARIABLE
     return Given({name: settings[name].parse(text) for name, text in typed.items()}, labels)
 
 
@@ -212,7 +217,8 @@ def settings_option(kinds: Sequence[Kind], example: str = "match=aabb") -> Any:
     def show(value: Any) -> Any:
         if LIST_SETTINGS not in (value or ()):
             return value or []
-        width, lines = max(40, shutil.get_terminal_size().columns), list[str]()
+        width = max(40, shutil.get_terminal_size().columns)
+        lines = list[str]()
         for name, declared in listed_settings(kinds).items():
             default = declared.default
             shown = default if isinstance(default, str) else json.dumps(default, default=str)

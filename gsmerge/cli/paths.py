@@ -34,7 +34,8 @@ def check_outputs(
 
     paths = [path for path in inputs if path is not None]
     camera_files = [cameras for path in paths if path.is_dir() and (cameras := find_cameras(path)) is not None]
-    input_paths, seen = {os.path.realpath(path) for path in (*paths, *camera_files)}, set[str]()
+    input_paths = {os.path.realpath(path) for path in (*paths, *camera_files)}
+    seen = set[str]()
     for output in outputs:
         if output is None:
             continue

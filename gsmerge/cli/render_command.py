@@ -107,7 +107,8 @@ def _choose_kind(output: Path, scenes: Sequence[Path], path: str | None, frames:
     Raises UsageError if output and options do not fit each other. A clip without a ``path`` gets the path "orbit".
     """
     suffix = output.suffix.lower()
-    is_clip, is_picture = suffix in CLIPS, suffix in PICTURES
+    is_clip = suffix in CLIPS
+    is_picture = suffix in PICTURES
     if suffix and not is_clip and not is_picture and not output.is_dir():
         expected = f"a picture, {opt.join_words(PICTURES)}, a clip, {opt.join_words(CLIPS)}, or a folder"
         raise UsageError(f"{output}: expected {expected}")

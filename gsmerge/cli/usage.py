@@ -110,8 +110,10 @@ def _suggest(option: str, command: Any) -> str:
     """Return the end of a message: what to type instead of an unknown ``option``; empty if nothing is known."""
     from gsmerge.cli.parameters import listed_settings
 
-    name, params = option.lstrip("-").replace("-", "_"), {param.name: param for param in command.params}
-    settings, synonym = {}, SYNONYMS.get(option.lstrip("-"))
+    name = option.lstrip("-").replace("-", "_")
+    params = {param.name: param for param in command.params}
+    settings = {}
+    synonym = SYNONYMS.get(option.lstrip("-"))
     with suppress(ImportError):  # the settings of training need torch, which may not be installed
         settings = listed_settings(params["set"].callback.kinds) if "set" in params else {}
     if name.removeprefix("no_") in settings:

@@ -33,7 +33,8 @@ def view(
     """Show a scene, alone or beside its compact versions, in the browser: photos, stills, 3D and scores in one file."""
     from gsmerge.reading.scene_files import find_scene_files
 
-    files, reading = find_scene_files(before, cameras=cameras, images=images, masks=masks), opt.read_hints(hint)
+    files = find_scene_files(before, cameras=cameras, images=images, masks=masks)
+    reading = opt.read_hints(hint)
     show_page(
         files, after or [], output, reading, targets=targets, light=light, open=open, overwrite=overwrite, json=json,
         quiet=quiet,
