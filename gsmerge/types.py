@@ -269,7 +269,8 @@ class Pixels(ArrayFields):
         homes = np.arange(mask.size, dtype=np.int32 if mask.size <= np.iinfo(np.int32).max else np.int64)
         if mask.all():
             return Pixels(homes, homes.astype(np.int32, copy=False).reshape(mask.shape), own=True)
-        homes, fronts = homes[mask.reshape(-1)], np.full(mask.size, -1, np.int32)
+        homes = homes[mask.reshape(-1)]
+        fronts = np.full(mask.size, -1, np.int32)
         fronts[homes] = np.arange(len(homes), dtype=np.int32)
         return Pixels(homes, fronts.reshape(mask.shape), own=True)
 
@@ -294,11 +295,15 @@ class Pixels(ArrayFields):
 
         The pixels are numbered over the selected views.
         """
-        view_pixels, view_rows = int(np.prod(self.fronts.shape[1:])), [self.rows_of_views[view] for view in views]
-        homes, fronts, num_selected = [self.homes[:0]], list[np.ndarray](), 0
+        view_pixels = int(np.prod(self.fronts.shape[1:]))
+        view_rows = [self.rows_of_views[view] for view in views]
+        homes = [self.homes[:0]]
+        fronts = list[np.ndarray]()
+        num_selected = 0
         for new_view, (view, rows) in enumerate(zip(views, view_rows, strict=True)):
             homes.append(self.homes[rows] + self.homes.dtype.type((new_view - view) * view_pixels))
-            view_fronts, positions = self.fronts[view], np.searchsorted(rows, self.fronts[view])
+            view_fronts = self.fronts[view]
+            positions = np.searchsorted(rows, self.fronts[view])
             fronts.append(np.where(view_fronts >= 0, num_selected + positions, -1).astype(np.int32))
             num_selected += len(rows)
         shape = len(view_rows), *self.fronts.shape[1:]
@@ -378,7 +383,9 @@ class Scene(ArrayFields):
         if self.names is None:
             object.__setattr__(self, "names", number_views(len(self.cameras)))
         check_fields(self)
-        v, h, w = len(self.cameras), self.cameras.height, self.cameras.width
+        v = len(self.cameras)
+        h = self.cameras.height
+        w = self.cameras.width
         if self.pixels is not None:
             check_shape("homes", self.pixels.homes, (len(self.gaussians),))
             check_shape("fronts", self.pixels.fronts, (v, h, w))
@@ -475,20 +482,6 @@ class Scene(ArrayFields):
 def make_scene(gaussians: Gaussians, cameras: Cameras) -> Scene:
     """Make a scene of Gaussians and cameras, without photos and pixels; the views are named by their numbers."""
     return Scene(gaussians, cameras, None, None, number_views(len(cameras)))
-
-
-def fill_pixels(scene: SceneT, added: Gaussians, empty_pixels: np.ndarray) -> SceneT:
-    """Add Gaussians to a scene that fill holes, each in an empty pixel.
-
-    ``empty_pixels [n]`` has the pixel of each added Gaussian, numbered over all views.
-    """
-    count, old_pixels = len(scene.gaussians), scene.get_pixels()
-    homes, fronts = old_pixels.homes, old_pixels.fronts.copy()
-    fronts.reshape(-1)[empty_pixels] = np.arange(count, count + len(added), dtype=np.int32)
-    pixels = replace(old_pixels, homes=np.concatenate([homes, empty_pixels.astype(homes.dtype)]), fronts=fronts)
-    filled = np.zeros(count, bool) if scene.filled is None else scene.filled
-    filled = np.concatenate([filled, np.ones(len(added), bool)])
-    return replace(scene, gaussians=Gaussians.concat([scene.gaussians, added]), pixels=pixels, filled=filled)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -90,7 +90,8 @@ def compare_photos(scene: PicturedScene, look: Look = "auto") -> tuple[PicturedS
     if stray:
         names = [scene.names[view] for view in stray]
         record_choices(photos_left_out=names)
-        are_few, listed = 2 * len(stray) <= len(photo_views), list_some(names)
+        are_few = 2 * len(stray) <= len(photo_views)
+        listed = list_some(names)
         result = f" and are not used: {listed}"
         if not are_few:
             result = f", so no photo is used: {listed}; check their names and order"
@@ -98,7 +99,8 @@ def compare_photos(scene: PicturedScene, look: Look = "auto") -> tuple[PicturedS
         if not are_few:
             return scene, (), []
     changes, toned = correct_tones(scene, pairs, matching)
-    hidden, pictures = np.zeros(scene.images.shape[:3], bool), None
+    hidden = np.zeros(scene.images.shape[:3], bool)
+    pictures = None
     if scene.has_own_pixels:
         hidden, pictures = _find_hidden(scene, changes)
         _note_hidden(scene, hidden, matching)
@@ -125,10 +127,12 @@ def correct_tones(scene: PicturedScene, pairs: Pairs, views: Sequence[int]) -> t
     photos, reduces errors, too. The inverse curve reduces no errors if photos and Gaussians differ by noise, which
     flattens the colours of Gaussians.
     """
-    curves, is_large = dict[int, np.ndarray](), False
+    curves = dict[int, np.ndarray]()
+    is_large = False
     stored = cut_blocks(pairs)
     groups = [group for group in _group_by_curve(pairs, views) if is_visible(stored.errors(group))]
-    toned, inverse = tone_blocks(pairs, groups), tone_blocks(pairs.exchange(), groups)
+    toned = tone_blocks(pairs, groups)
+    inverse = tone_blocks(pairs.exchange(), groups)
     for group in groups:
         errors = stored.errors(group)
         if explains(errors, toned.errors(group)) and stands_out(errors - inverse.errors(group)):
@@ -140,7 +144,8 @@ def correct_tones(scene: PicturedScene, pairs: Pairs, views: Sequence[int]) -> t
         return [PhotoChange()] * len(pairs), ""
     middle_grey = 128  # level of 255 at which notes report the change of tone
     factors = [float(curve[:, middle_grey].mean()) / (middle_grey / 255) for curve in curves.values()]
-    low, high = min(factors), max(factors)
+    low = min(factors)
+    high = max(factors)
     factor = f"{low:.2f}" if high - low < 0.01 else f"{low:.2f} to {high:.2f}"
     change = (
         f"{len(curves)} of {len(views)} photos have another tone than their Gaussians (exposure, gamma or linear"
@@ -155,7 +160,8 @@ def find_grey(pairs: Pairs, views: Sequence[int]) -> dict[int, float]:
     Returns for each such view the variation of the hues in its photo, divided by that of the Gaussians' hues.
     """
     hue_sample = 2_000  # approximate number of pixels of a photo whose hues are compared, if it has as many
-    shares, step = dict[int, float](), 1 + pairs.photos[0].size // (3 * hue_sample)
+    shares = dict[int, float]()
+    step = 1 + pairs.photos[0].size // (3 * hue_sample)
     for view in views:
         weights = pairs.shown.weights[view].reshape(-1)[::step]
         photo, shown = (images[view].reshape(-1, 3)[::step] for images in (pairs.photos, pairs.shown.pictures))
@@ -170,7 +176,8 @@ def _color_photos(scene: PicturedScene, grey: Mapping[int, float]) -> PicturedSc
 
     ``grey`` is the result of :func:`find_grey`.
     """
-    changes, views = [PhotoChange()] * len(scene), list(grey)
+    changes = [PhotoChange()] * len(scene)
+    views = list(grey)
     if scene.has_own_pixels:
         colors = row_pictures(scene)[views]
     else:
@@ -260,8 +267,10 @@ def _has_other_look(scene: PicturedScene, pairs: Pairs, views: Sequence[int]) ->
 
 def are_exchanged(pairs: Pairs) -> bool:
     """Return True if photos with red and blue exchanged match the pictures, and a linear map matches no better."""
-    stored, exchanged = cut_blocks(pairs), cut_blocks(pairs.with_photos(pairs.photos[..., ::-1]))
-    before, after = stored.errors(), exchanged.errors()
+    stored = cut_blocks(pairs)
+    exchanged = cut_blocks(pairs.with_photos(pairs.photos[..., ::-1]))
+    before = stored.errors()
+    after = exchanged.errors()
     return explains(before, after) and not explains(after, map_blocks(stored).errors())
 
 
@@ -270,7 +279,8 @@ def _is_mapped(pairs: Pairs) -> bool:
     stored = cut_blocks(pairs)
     if not is_visible(stored.errors()):
         return False
-    toned, mapped = tone_blocks(pairs, _group_by_curve(pairs, range(len(pairs)))), map_blocks(stored)
+    toned = tone_blocks(pairs, _group_by_curve(pairs, range(len(pairs))))
+    mapped = map_blocks(stored)
     return is_visible(toned.errors()) and all(
         explains(blocks.errors(), mapped.errors()) for blocks in (toned, plain_blocks(stored))
     )

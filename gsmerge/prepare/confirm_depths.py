@@ -20,7 +20,8 @@ from gsmerge.types import Scene
 CONFIRM_NEIGHBORS = 16  # nearest other views in which the sampled pixels are looked up
 # A point that is projected back agrees with its pixel up to a distance: the share AGREEMENT_SHARE of the longer side,
 # but at least AGREEMENT_PIXELS
-AGREEMENT_SHARE, AGREEMENT_PIXELS = 1 / 120, 1.5
+AGREEMENT_SHARE = 1 / 120
+AGREEMENT_PIXELS = 1.5
 SAME_LOG_DEPTH = 0.05  # difference of the logarithms of two depths of one surface
 LEAST_DEPTH = 1e-9  # least depth, canonical units
 # Parts of pictures, as ranges of columns and of rows in thirds. A part is poor if the share of its pixels that other
@@ -62,21 +63,27 @@ def _count_view(scene: Scene, view: int) -> np.ndarray:
     The first part is the whole picture; the other parts are ``THIRDS``. The pixels are looked up in the nearest other
     views.
     """
-    means, cameras = scene.gaussians.means, scene.cameras
-    width, height = cameras.width, cameras.height
+    means = scene.gaussians.means
+    cameras = scene.cameras
+    width = cameras.width
+    height = cameras.height
     fronts = scene.get_pixels().fronts.reshape(len(scene), -1)
     rows = np.flatnonzero(fronts[view] >= 0)
     rows = rows[np.random.default_rng(view).integers(max(len(rows), 1), size=min(len(rows), CONFIRM_PIXELS))]
     points = means[fronts[view, rows]].astype(np.float64)
     neighbors = nearest_views(cameras.centres, view)[:CONFIRM_NEIGHBORS]
     pixels, depths = project(points, cameras[neighbors])
-    x, y = pixels[..., 0], pixels[..., 1]
+    x = pixels[..., 0]
+    y = pixels[..., 1]
     inside = (depths > LEAST_DEPTH) & (x > 0) & (y > 0) & (x < width) & (y < height)
     neighbor_ids, ids = np.nonzero(inside)  # pairs of a neighbour and a point in its picture
-    column, row = x[neighbor_ids, ids].astype(np.int64), y[neighbor_ids, ids].astype(np.int64)
+    column = x[neighbor_ids, ids].astype(np.int64)
+    row = y[neighbor_ids, ids].astype(np.int64)
     front = fronts[neighbors[neighbor_ids], row * width + column]
     has_front = front >= 0
-    neighbor_ids, ids = neighbor_ids[has_front], ids[has_front]  # only pairs with a Gaussian at the point's pixel
+    # only pairs with a Gaussian at the point's pixel
+    neighbor_ids = neighbor_ids[has_front]
+    ids = ids[has_front]
     is_alone = np.asarray(~inside.any(0))  # no view sees the pixel's position
     is_counted = is_alone.copy()
     is_counted[ids] = True
@@ -95,7 +102,9 @@ def _count_view(scene: Scene, view: int) -> np.ndarray:
     sees_through = ~agrees & ((log_depths < -2 * SAME_LOG_DEPTH) | ((log_depths < 0) & (distance > 2)))
     num_same, num_through = (np.bincount(ids[mask], minlength=len(rows)) for mask in (agrees, sees_through))
     kinds = (num_same > 0) & (num_same >= num_through), num_through > num_same, is_alone
-    column, row = 3 * (rows % width) // width, 3 * (rows // width) // height  # in thirds of the picture
+    # in thirds of the picture
+    column = 3 * (rows % width) // width
+    row = 3 * (rows // width) // height
     parts = [is_counted]
     for (left, right_end), (top, bottom) in THIRDS.values():
         parts.append(is_counted & (column >= left) & (column < right_end) & (row >= top) & (row < bottom))

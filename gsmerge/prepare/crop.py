@@ -25,7 +25,8 @@ def crop_scene(scene: Scene, crop: str) -> Scene:
 
     Counts, the fit and scores of the returned scene refer to the crop. Raises UsageError if no Gaussian is inside.
     """
-    means, region = scene.gaussians.means, find_region(crop)
+    means = scene.gaussians.means
+    region = find_region(crop)
     inside = lies_inside(region, means)
     count = int(inside.sum())
     if count == 0:
@@ -46,7 +47,8 @@ def crop_scene(scene: Scene, crop: str) -> Scene:
 
         def shows_inside(image: np.ndarray) -> np.ndarray:
             """Return a mask ``[h,w]`` of the pixels of a render that mostly show Gaussians inside."""
-            inside_opacity, opacity = image[..., 0], image[..., 1]
+            inside_opacity = image[..., 0]
+            opacity = image[..., 1]
             return np.asarray(inside_opacity > MOSTLY * np.maximum(opacity, usual_opacity(opacity)))
 
         with use_threads() as threads:

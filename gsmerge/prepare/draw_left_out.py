@@ -21,7 +21,9 @@ from gsmerge.types import PicturedScene
 # the radius HOLE, and in the rim RIM around these holes, where Gaussians of an object reach over its edge. In a view
 # with a large empty part that no mask leaves out, as of an object, other holes are empty, too, and photos do not count
 # in the next RING widths
-HOLE, RIM, RING = 3, 2, 3
+HOLE = 3
+RIM = 2
+RING = 3
 SOFT = 1.5  # pixels at the edge of an object before a uniform background, where the photo mixes both
 NOISE = np.float32(16 / 255)  # largest difference between the colour of a uniform background and a pixel of it
 LEAST_ALIKE = 0.95  # least share of the pixels of a uniform background that differ less
@@ -36,11 +38,15 @@ def mask_background(scene: PicturedScene) -> tuple[PicturedScene, str]:
     """
     if scene.region is not None:
         return scene, ""
-    bare, counts, num_views = find_bare(scene), counting_pixels(scene), 0
+    bare = find_bare(scene)
+    counts = counting_pixels(scene)
+    num_views = 0
     parts = {view: part for view in range(len(scene)) if (part := large_parts(bare[view]) & counts[view]).any()}
     if not parts:
         return scene, ""
-    unit, counts, images = measure_unit(scene), counts.copy(), [*scene.images]
+    unit = measure_unit(scene)
+    counts = counts.copy()
+    images = [*scene.images]
     importance = np.ones(counts.shape, np.float32) if scene.importance is None else scene.importance.copy()
     for view, part in parts.items():
         photo = images[view]
@@ -74,15 +80,18 @@ def draw_left_out(scene: PicturedScene, masks: np.ndarray | None) -> PicturedSce
     counts = counting_pixels(scene).copy()
     if counts.all() or scene.region is not None:  # a cropped scene is empty beyond its region
         return scene
-    unit, holes = measure_unit(scene), np.zeros(counts.shape, bool) if scene.empty is None else scene.empty > 0
+    unit = measure_unit(scene)
+    holes = np.zeros(counts.shape, bool) if scene.empty is None else scene.empty > 0
     drawn = render(scene.gaussians, scene.cameras)
-    colors, transmittance = drawn.images.clip(0, 1), 1 - drawn.alphas[..., 0]
+    colors = drawn.images.clip(0, 1)
+    transmittance = 1 - drawn.alphas[..., 0]
     bare = transmittance > COVERED_TRANSMITTANCE
     if scene.beyond is not None:  # nothing is known there
         bare &= ~scene.beyond
     solid = np.zeros_like(bare) if scene.beyond is None else scene.beyond
     if scene.has_own_pixels:  # pictures already have the colours of the views' own Gaussians, which are solid
-        colors, transmittance = scene.images.copy(), np.zeros_like(transmittance)
+        colors = scene.images.copy()
+        transmittance = np.zeros_like(transmittance)
         solid = ~find_bare(scene)
     for view, hole in enumerate(holes):
         left_out = np.zeros(hole.shape, bool) if masks is None else ~masks[view]
@@ -91,7 +100,8 @@ def draw_left_out(scene: PicturedScene, masks: np.ndarray | None) -> PicturedSce
         counts[view] &= ~_grow(cut, RING * unit)
         left_out |= cut
         is_empty = (hole | (_grow(nothing & left_out, RIM * unit) & ~solid[view])) & left_out
-        colors[view][is_empty], transmittance[view][is_empty] = 0, 1
+        colors[view][is_empty] = 0
+        transmittance[view][is_empty] = 1
     changes = [PhotoChange(cover=~counting, colors=picture) for counting, picture in zip(counts, colors, strict=True)]
     images = np.stack([change(photo) for change, photo in zip(changes, scene.images, strict=True)])
     large = None if scene.large_photos is None else change_large(scene.large_photos, changes)

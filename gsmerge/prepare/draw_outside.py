@@ -29,9 +29,12 @@ from gsmerge.types import Cameras, Gaussians, PicturedScene, Pixels, make_scene
 # are outside of all views. Two of the four views of a narrow capture miss .02 of its Gaussians, and two of the five
 # views of another capture miss .006
 LEAST_OUTSIDE = 0.005
-SOURCES, STEPS_BACK = 4, 8  # number of views beside which cameras are placed, and of steps back from each
+# number of views beside which cameras are placed, and of steps back from each
+SOURCES = 4
+STEPS_BACK = 8
 # Bounds of a step: distance backwards as a share of the depth, rotation to the sides and rotation up or down in degrees
-BESIDE_LOW, BESIDE_HIGH = (0.2, -20.0, -15.0), (1.0, 20.0, 15.0)
+BESIDE_LOW = (0.2, -20.0, -15.0)
+BESIDE_HIGH = (1.0, 20.0, 15.0)
 
 
 def draw_outside(scene: PicturedScene) -> tuple[PicturedScene, str]:
@@ -54,7 +57,8 @@ def draw_outside(scene: PicturedScene) -> tuple[PicturedScene, str]:
     useful = np.flatnonzero(counting.mean((1, 2)) > LEAST_OUTSIDE)
     if len(useful) == 0:
         return scene, ""
-    placed, counting = placed[useful], counting[useful]
+    placed = placed[useful]
+    counting = counting[useful]
     places = count_words(len(placed), "place", "beside the views")
     unseen = f"no view sees {100 * outside.mean():.0f} % of the Gaussians"
     change = f"{unseen}: pictures of the input from {places} stand for photos there"
@@ -67,13 +71,16 @@ def _place_beside(gaussians: Gaussians, outside: np.ndarray, cameras: Cameras) -
 
     Candidates step back from some of the views, or turn about the centre of a view.
     """
-    sample, step = thin_out(gaussians, CANDIDATE_GAUSSIANS), max(1, -(-len(gaussians) // CANDIDATE_GAUSSIANS))
+    sample = thin_out(gaussians, CANDIDATE_GAUSSIANS)
+    step = max(1, -(-len(gaussians) // CANDIDATE_GAUSSIANS))
     sources = cameras[even_views(len(cameras), min(len(cameras), SOURCES))]
     back = outside_cameras(sample.means, sources, STEPS_BACK * len(sources), BESIDE_LOW, BESIDE_HIGH)
     # Copies of the views' cameras turn full circle about their centres in steps of half the field of view. At each step
     # one copy looks straight ahead, one looks up by half the field, and one looks down
-    viewmats, views = [], []
-    width, height = cameras.width, cameras.height
+    viewmats = []
+    views = []
+    width = cameras.width
+    height = cameras.height
     for view, (viewmat, K) in enumerate(zip(sources.viewmats.astype(np.float64), sources.Ks, strict=True)):
         wide, high = (arctan2(side / 2, focal) for side, focal in ((width, K[0, 0]), (height, K[1, 1])))
         for azimuth in np.arange(0, 2 * np.pi, wide):  # `wide` and `high` are half the field, in radians
@@ -90,7 +97,9 @@ def _place_beside(gaussians: Gaussians, outside: np.ndarray, cameras: Cameras) -
 def _with_drawings(scene: PicturedScene, cameras: Cameras, counting: np.ndarray) -> PicturedScene:
     """Add drawings of a scene from ``cameras``, which count like photos at pixels in the mask ``counting [c,h,w]``."""
     masks = counting_pixels(scene)
-    importance, empty, large = scene.importance, scene.empty, scene.large_photos
+    importance = scene.importance
+    empty = scene.empty
+    large = scene.large_photos
     if large is not None:
         photos, first = large, max(large.ids) + 1
         Ks = cameras.Ks * np.array([[large.width / cameras.width], [large.height / cameras.height], [1.0]])
@@ -106,7 +115,8 @@ def _with_drawings(scene: PicturedScene, cameras: Cameras, counting: np.ndarray)
         ids = *large.ids, *range(first, first + len(cameras))
         large = replace(large, Ks=np.concatenate([large.Ks, Ks]), ids=ids, read=read)
     # Gaussians with a pixel in the scene keep it
-    pixels, placed = scene.get_pixels(), find_pixels(make_scene(scene.gaussians, cameras))
+    pixels = scene.get_pixels()
+    placed = find_pixels(make_scene(scene.gaussians, cameras))
     placed_homes = np.where(placed.homes < 0, -1, placed.homes + len(scene) * scene.pixels_per_view)
     homes = np.where(pixels.homes < 0, placed_homes, pixels.homes)
     return replace(

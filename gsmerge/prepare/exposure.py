@@ -38,7 +38,9 @@ from gsmerge.settings.stages import Exposure
 from gsmerge.types import Cameras, PicturedScene, Scene
 
 EXPOSURE_PIXELS = 2000  # pixels of a view that are looked up in the other views
-NOISE_LEVEL, CLIPPED_LEVEL = 0.05, 0.95  # colours in between are neither noise nor clipped
+# colours in between are neither noise nor clipped
+NOISE_LEVEL = 0.05
+CLIPPED_LEVEL = 0.95
 # The bounds from DIFFERENT to UNEXPECTED were chosen on the exports of 15 captures whose exposures were not changed.
 # Exposures differ if the root mean square of the logarithmic gains is above DIFFERENT. It is above DIFFERENT in six of
 # these 15 captures, and in nine of ten cases if five photos get random gains of 0.8 to 1.25
@@ -48,7 +50,8 @@ DIFFERENT = 0.06
 # gains are 0.1 or more. If the brightness of places varies more than the gains, the slope says little. So for a
 # metering camera, the correlation of gains and the brightness of places must also be below OPPOSED; it is -0.67 to
 # -0.99 for cameras that metered light
-FOLLOWS, OPPOSED = 0.5, -0.6
+FOLLOWS = 0.5
+OPPOSED = -0.6
 # Gains are unexpected if share_unexpected returns more than UNEXPECTED. For random gains of 0.5 to 2 the function
 # returns 0.71 to 1.22, or 0.67 for four views in a row. If exposure drifts, share_unexpected returns 0.19 to 0.57, and
 # results lose 1.7 dB or more if gains are removed
@@ -57,7 +60,8 @@ COARSE_STEP = 4  # the brightness of a photo is measured on every COARSE_STEP-th
 BRIGHT_GAIN = 1.15  # clipped pixels do not count in photos with a gain above BRIGHT_GAIN
 CLIPPED_NEIGHBOURS = 8  # views in which the surfaces of clipped pixels are looked up
 # Numbers of nearest views and of farther views with which a view is compared; see choose_partners
-NEAREST_VIEWS, FARTHER_VIEWS = 6, 2
+NEAREST_VIEWS = 6
+FARTHER_VIEWS = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,12 +87,14 @@ def equalise_exposure(scene: PicturedScene, views: Sequence[int], exposure: Expo
     pairs = _measure_pairs(scene, views)
     gains = _solve_gains(pairs, len(scene))
     factors = exp(gains).round(3)
-    low, high = factors.min(), factors.max()
+    low = factors.min()
+    high = factors.max()
     if low == high:
         return scene, ""
     differ = f"the same surfaces differ in brightness by factors of {low:.2f} to {high:.2f} between photos"
     if exposure == "auto":
-        view_gains, photos = gains[list(views)], [scene.images[view][::COARSE_STEP, ::COARSE_STEP] for view in views]
+        view_gains = gains[list(views)]
+        photos = [scene.images[view][::COARSE_STEP, ::COARSE_STEP] for view in views]
         if root_mean_square(view_gains) < DIFFERENT:
             return scene, ""
         brightness = log(np.maximum([photo.mean((0, 1), dtype=np.float64) for photo in photos], 1 / 255))
@@ -118,7 +124,8 @@ def is_metered(brightness: np.ndarray, gains: np.ndarray) -> bool:
     ``brightness [v,3]`` of the photos and ``gains [v,3]`` are logarithms. If gains are random, photos with larger gains
     are brighter; if light was metered, they are not.
     """
-    gains, brightness = gains - gains.mean(0), brightness - brightness.mean(0)
+    gains = gains - gains.mean(0)
+    brightness = brightness - brightness.mean(0)
     slope = float((gains * brightness).sum() / max((gains * gains).sum(), 1e-12))
     return slope < FOLLOWS and correlation(gains.ravel(), (brightness - gains).ravel()) < OPPOSED
 
@@ -148,7 +155,8 @@ class _Pixels:
 
         Returns indices into ``rows``, and the pixels at which the other view shows the surface.
         """
-        viewmat, K = self.cameras.viewmats[other].astype(np.float64), self.cameras.Ks[other].astype(np.float64)
+        viewmat = self.cameras.viewmats[other].astype(np.float64)
+        K = self.cameras.Ks[other].astype(np.float64)
         same_depth = 0.05  # difference of the logarithms of two depths of one surface
         return find_surfaces(
             self.means[view],
@@ -175,19 +183,22 @@ def _pixels_of(scene: Scene) -> _Pixels:
 
 def _measure_pairs(scene: PicturedScene, views: Sequence[int]) -> list[_Pair]:
     """Measure the ratios of colours between pairs of ``views`` that show the same surfaces."""
-    size, pixels = scene.pixels_per_view, _pixels_of(scene)
+    size = scene.pixels_per_view
+    pixels = _pixels_of(scene)
     photos = scene.images.reshape(len(scene), size, 3)
     sample = np.random.default_rng(0).permutation(size)[:EXPOSURE_PIXELS]
     partners = choose_partners(camera_distances(scene.cameras[list(views)]))
 
     def measure_view(number: int) -> list[_Pair]:
         """Measure the ratios of colours between one of ``views`` and the views with which it is compared."""
-        view, pairs = views[number], list[_Pair]()
+        view = views[number]
+        pairs = list[_Pair]()
         rows = sample[pixels.valid[view, sample]]
         min_pixels = 60  # least number of shared pixels from which a ratio is measured
         for other in (views[partner] for partner in partners[number]):
             shared, other_rows = pixels.look_up(view, rows, other)
-            here, there = photos[view].take(rows[shared], axis=0), photos[other].take(other_rows, axis=0)
+            here = photos[view].take(rows[shared], axis=0)
+            there = photos[other].take(other_rows, axis=0)
             red, green, blue = (
                 (here > NOISE_LEVEL) & (here < CLIPPED_LEVEL) & (there > NOISE_LEVEL) & (there < CLIPPED_LEVEL)
             ).T
@@ -215,10 +226,12 @@ def choose_partners(distances: np.ndarray) -> np.ndarray:
 
 def _solve_gains(pairs: Sequence[_Pair], num_views: int) -> np.ndarray:
     """Solve for the logarithmic gains ``[v,3]`` of all views, with mean zero; without pairs all gains are zero."""
-    matrix, right = np.full((num_views, num_views), 1.0 / num_views), np.zeros((num_views, 3))
+    matrix = np.full((num_views, num_views), 1.0 / num_views)
+    right = np.zeros((num_views, 3))
     max_weighted_pixels = 1000  # above this number of shared pixels, the weight of a pair of views does not grow
     for pair in pairs:
-        ends, weight = [pair.view, pair.other], np.sqrt(min(pair.count, max_weighted_pixels))
+        ends = [pair.view, pair.other]
+        weight = np.sqrt(min(pair.count, max_weighted_pixels))
         matrix[np.ix_(ends, ends)] += weight * np.array([[1, -1], [-1, 1]])
         right[ends] += weight * np.array([-pair.ratios, pair.ratios])
     matrix[np.diag_indices(num_views)] += 1e-6  # views without pairs get a gain of one
@@ -238,7 +251,8 @@ def _divide_by_gains(scene: PicturedScene, gains: np.ndarray) -> PicturedScene:
 
     def find_shown(view: int) -> np.ndarray:
         """Return a mask ``[h*w]`` of the clipped pixels of a view whose surface another view shows unclipped."""
-        rows, is_shown = np.flatnonzero(flat[view] & pixels.valid[view]), np.zeros_like(flat[view])
+        rows = np.flatnonzero(flat[view] & pixels.valid[view])
+        is_shown = np.zeros_like(flat[view])
         for other in order[view]:
             shared, other_rows = pixels.look_up(view, rows, other)
             is_shown[rows[shared[~flat[other, other_rows]]]] = True
@@ -258,7 +272,8 @@ def _divide_by_gains(scene: PicturedScene, gains: np.ndarray) -> PicturedScene:
 
     parallel_map(divide, range(len(scene)))
     views = scene.get_pixels().homes // scene.pixels_per_view
-    g, row_factors = scene.gaussians, factors[views][:, None]
+    g = scene.gaussians
+    row_factors = factors[views][:, None]
     sh0 = rgb_to_sh0(sh0_to_rgb(g.sh0) * row_factors).astype(np.float32)
     gaussians = replace(g, sh0=sh0, shN=g.shN * row_factors)
     large = None if scene.large_photos is None else change_large(scene.large_photos, changes)

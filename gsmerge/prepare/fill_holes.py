@@ -24,7 +24,7 @@ from gsmerge.method.raster.images import tile_views
 from gsmerge.prepare.photo_change import PhotoChange, change_large
 from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.types import Gaussians, PicturedScene, fill_pixels
+from gsmerge.types import Gaussians, PicturedScene
 
 # The numbers from HOLE_OPACITY to BARE were chosen on exports of eight captures as Depth Anything 3 writes them, and on
 # the same exports with shuffled and with merged rows
@@ -32,11 +32,14 @@ HOLE_OPACITY = 0.75  # opacity of the drawing below which a pixel is empty
 # NOTHING and SPARSE are shares of the usual opacity of a view, which is low if the export has few rows. A pixel shows
 # nothing if its opacity is below the share NOTHING. A pixel is in an empty part if it shows nothing, and if the mean
 # opacity around it is below the share SPARSE
-NOTHING, SPARSE = 0.5, 0.25
+NOTHING = 0.5
+SPARSE = 0.25
 # A part of a picture stays empty if a square with the side LARGE_SIDE, a share of the picture's longer side, fits into
 # the part. All squares that fit must together cover at least the share LARGE_AREA of the picture. A rim of RIM_PIXELS
 # pixels is taken off each empty part
-LARGE_SIDE, LARGE_AREA, RIM_PIXELS = 1 / 12, 0.12, 2
+LARGE_SIDE = 1 / 12
+LARGE_AREA = 0.12
+RIM_PIXELS = 2
 GAP_WIDTH = 1 / 53  # beside large empty parts, only gaps narrower than this share of the longer side are filled
 MOST_EMPTY = 0.5  # from this share of empty pixels on, the scene may be only a part of what the photos show
 FACTORS = 2.0 ** np.linspace(0, 3, 13)  # candidate depths, relative to the depth of a view's farthest surface
@@ -55,7 +58,9 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = Fa
     ``everywhere``, large empty parts are filled, too. In a cropped scene, all pixels without Gaussians stay empty.
     A note says what stays empty.
     """
-    fronts, is_cropped, beyond = scene.get_pixels().fronts, scene.region is not None, scene.beyond
+    fronts = scene.get_pixels().fronts
+    is_cropped = scene.region is not None
+    beyond = scene.beyond
     fillable = shown & (fronts < 0)  # pixels with a picture and without a Gaussian
     bare = find_bare(scene)
     views = [
@@ -95,9 +100,26 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = Fa
         pixels = np.flatnonzero(holes)
         if scene.region is not None:
             inside = lies_inside(scene.region, added.means)
-            added, pixels = added[inside], pixels[inside]
+            added = added[inside]
+            pixels = pixels[inside]
         scene = fill_pixels(scene, added, pixels)
     return _leave_empty(scene, empty)
+
+
+def fill_pixels(scene: PicturedScene, added: Gaussians, empty_pixels: np.ndarray) -> PicturedScene:
+    """Add Gaussians to a scene that fill holes, each in an empty pixel.
+
+    ``empty_pixels [n]`` has the pixel of each added Gaussian, numbered over all views.
+    """
+    count = len(scene.gaussians)
+    old_pixels = scene.get_pixels()
+    homes = old_pixels.homes
+    fronts = old_pixels.fronts.copy()
+    fronts.reshape(-1)[empty_pixels] = np.arange(count, count + len(added), dtype=np.int32)
+    pixels = replace(old_pixels, homes=np.concatenate([homes, empty_pixels.astype(homes.dtype)]), fronts=fronts)
+    filled = np.zeros(count, bool) if scene.filled is None else scene.filled
+    filled = np.concatenate([filled, np.ones(len(added), bool)])
+    return replace(scene, gaussians=Gaussians.concat([scene.gaussians, added]), pixels=pixels, filled=filled)
 
 
 def find_bare(scene: PicturedScene) -> np.ndarray:
@@ -142,13 +164,15 @@ def _fit_map(scene: PicturedScene, view: int) -> np.ndarray | None:
     """
     if scene.depths is None:
         return None
-    known, fronts = scene.depths[view].astype(np.float64), scene.get_pixels().fronts[view]
+    known = scene.depths[view].astype(np.float64)
+    fronts = scene.get_pixels().fronts[view]
     known[~(np.isfinite(known) & (known > 0))] = np.nan
     both = (fronts >= 0) & np.isfinite(known)
     if not both.any():
         return None
     depths = camera_depths(scene.gaussians.means[fronts[both]].astype(np.float64), scene.cameras.viewmats[view])
-    ratios, usual = depths / known[both], np.median(depths)
+    ratios = depths / known[both]
+    usual = np.median(depths)
     unit = np.median(ratios)
     explains = np.median(np.abs(ratios / unit - 1)) < np.median(np.abs(depths / usual - 1))
     return known * unit if explains else None
@@ -164,7 +188,8 @@ def large_parts(empty: np.ndarray) -> np.ndarray:
     if empty.mean() < LARGE_AREA:
         return np.zeros_like(empty)
     side = 2 * round(LARGE_SIDE * max(empty.shape) / 2) + 1
-    square, rim = np.ones((side, side), np.uint8), np.ones((2 * RIM_PIXELS + 1,) * 2, np.uint8)
+    square = np.ones((side, side), np.uint8)
+    rim = np.ones((2 * RIM_PIXELS + 1,) * 2, np.uint8)
     opened = cv2.morphologyEx(empty.astype(np.uint8), cv2.MORPH_OPEN, square) > 0
     if opened.mean() < LARGE_AREA:
         return np.zeros_like(empty)
@@ -189,7 +214,8 @@ def _leave_empty(scene: PicturedScene, empty: np.ndarray) -> PicturedScene:
             " these parts stay empty, and photos do not count there; --set extent=photos fills them"
         )
     images = np.where(empty[..., None], np.float32(0), scene.images)
-    masks, large = ~empty if scene.masks is None else scene.masks & ~empty, scene.large_photos
+    masks = ~empty if scene.masks is None else scene.masks & ~empty
+    large = scene.large_photos
     shares = empty.astype(np.float32) if scene.empty is None else np.maximum(scene.empty, empty)
     if large is not None:
         black = np.zeros((*empty.shape[1:], 3), np.float32)
@@ -204,19 +230,25 @@ def _fill_view(scene: PicturedScene, view: int, holes: np.ndarray, edges: _Edges
     colours are averaged over neighbouring holes. If no other view sees the points of a ray, the depth of the surface
     beside the hole is chosen.
     """
-    cameras, centres, eye = scene.cameras, scene.cameras.centres, scene.cameras.centres[view]
+    cameras = scene.cameras
+    centres = scene.cameras.centres
+    eye = scene.cameras.centres[view]
     rays = pixel_rays(holes, cameras.Ks[view], cameras.viewmats[view])
-    edge_depths, far_depths = edges.beside.astype(np.float64), edges.farthest * FACTORS[:, None]
+    edge_depths = edges.beside.astype(np.float64)
+    far_depths = edges.farthest * FACTORS[:, None]
     depths = np.concatenate([edge_depths[None], np.maximum(far_depths, edge_depths)])  # [d,n] candidates
     # the point of a ray at a depth has the homogeneous pixel `start + depth * along` in another view
     neighbors = [i for i in nearest_views(centres, view) if (centres[i] != eye).any()][:HOLE_NEIGHBORS]
     projected = []
     for neighbor in neighbors:
-        K, (rotation, translation) = cameras.Ks[neighbor], np.split(cameras.viewmats[neighbor, :3], [3], 1)
+        K = cameras.Ks[neighbor]
+        rotation, translation = np.split(cameras.viewmats[neighbor, :3], [3], 1)
         start = matmul(K, matmul(rotation, eye) + translation[:, 0])
         projected.append((start, np.ascontiguousarray(matmul(matmul(rays, rotation.T), K.T).T)))
-    colors, pixels = scene.images[view][holes], np.flatnonzero(holes)
-    best_depths, best_costs = depths[0], np.full(len(rays), np.inf, np.float32)
+    colors = scene.images[view][holes]
+    pixels = np.flatnonzero(holes)
+    best_depths = depths[0]
+    best_costs = np.full(len(rays), np.inf, np.float32)
     min_gain = 0.001  # decrease in the difference of colours (sRGB) that each step to a farther depth has to bring
     min_weight = 1e-3  # least weight, in the window of DIFFERENCE_BLUR, of pixels that other views see
     for step, depth in enumerate(depths):
@@ -225,7 +257,8 @@ def _fill_view(scene: PicturedScene, view: int, holes: np.ndarray, edges: _Edges
             add_differences(scene.images[neighbor], along, start, depth, colors, pixels, sums)
         total, number = blur(sums, DIFFERENCE_BLUR).reshape(-1, 2)[pixels].T
         cost = np.where(number > min_weight, total / np.maximum(number, min_weight), np.inf) + min_gain * step
-        best_depths, best_costs = np.where(cost < best_costs, depth, best_depths), np.minimum(cost, best_costs)
+        best_depths = np.where(cost < best_costs, depth, best_depths)
+        best_costs = np.minimum(cost, best_costs)
     if edges.known is not None:
         farthest = edges.farthest * FACTORS[-1]
         best_depths = np.where(np.isfinite(edges.known), np.minimum(edges.known, farthest), best_depths)

@@ -40,7 +40,8 @@ BORDER = 2  # width in pixels of the border that is not compared
 POSE_PIXELS = 1500  # compared pixels of a view, those with the largest gradients
 # Compared pixels of a view, and largest number of steps, at the smallest size of the photos. Scenes with right poses
 # get no further steps, so few pixels and steps save time
-FIRST_PIXELS, FIRST_STEPS = 600, 2
+FIRST_PIXELS = 600
+FIRST_STEPS = 2
 POSE_NEIGHBOURS = 4  # number of other views with which a view is compared
 POSE_STEPS = 6  # largest number of Gauss-Newton steps at each size
 TOGETHER = 16  # pairs of views that one task compares
@@ -48,10 +49,13 @@ POSE_BLUR = 0.7  # blur of the photos, standard deviation in pixels
 # Detail of photos is finer than the blur DETAIL, in pixels. Highlights are smooth. If highlights mislead the new poses,
 # the detail of surfaces agrees less than with the old poses. New poses are dropped if detail agrees less by more than
 # CHANCE standard errors
-DETAIL, CHANCE = 2.0, 2.0
+DETAIL = 2.0
+CHANCE = 2.0
 # Errors of poses are assumed to have the standard deviations PRIOR_TURN in radians and PRIOR_SHIFT in canonical units.
 # PRIOR is the weight of this assumption beside the photos
-PRIOR_TURN, PRIOR_SHIFT, PRIOR = 0.026, 0.03, 30.0
+PRIOR_TURN = 0.026
+PRIOR_SHIFT = 0.03
+PRIOR = 30.0
 # The gain of a view is the share of its photos' disagreement that new poses remove. Poses are moved only if some view
 # has a gain above LEAST_GAIN at every size. At the largest size, the gain of some view must also be above VIEW_GAIN, or
 # the gain of all views together above MEAN_GAIN. Right poses have gains, too, if the depth is wrong. At the largest
@@ -59,7 +63,9 @@ PRIOR_TURN, PRIOR_SHIFT, PRIOR = 0.026, 0.03, 30.0
 # gains up to 0.28 for a view and 0.18 for all. If all poses are wrong by half a degree, the gain of all views is at
 # least 0.22. If a single pose is wrong, the gain of its view is 0.32 (measured on 14 captures). In doubt the poses are
 # not moved, because photos outside the scene have poses in the same frame as the input
-LEAST_GAIN, VIEW_GAIN, MEAN_GAIN = 0.1, 0.3, 0.2
+LEAST_GAIN = 0.1
+VIEW_GAIN = 0.3
+MEAN_GAIN = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,11 +144,15 @@ def move_poses(scene: PicturedScene, views: Sequence[int], *, always: bool = Fal
 
 def _choose_pairs(scene: PicturedScene, views: Sequence[int]) -> np.ndarray:
     """Choose pairs of views ``[p,2]``, in both orders: each view with the neighbours that it overlaps most."""
-    cameras, fronts = scene.cameras, scene.get_pixels().fronts.reshape(len(scene), -1)
+    cameras = scene.cameras
+    fronts = scene.get_pixels().fronts.reshape(len(scene), -1)
     overlap_pixels = 400  # the neighbours of a view are chosen by about this many of its pixels
     step = max(1, scene.pixels_per_view // overlap_pixels)
-    viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
-    pairs, candidates, anywhere = set(), set(views), np.full((len(scene), 1, 1), np.inf)
+    viewmats = cameras.viewmats.astype(np.float64)
+    Ks = cameras.Ks.astype(np.float64)
+    pairs = set()
+    candidates = set(views)
+    anywhere = np.full((len(scene), 1, 1), np.inf)
     min_overlap = 0.2  # share of a view's pixels that a neighbour must see
     for view in views:
         rows = fronts[view, ::step]
@@ -194,7 +204,8 @@ def _make_level(
     # The second view of a pair should show the greys of the first, plus the change of colour of the Gaussians from the
     # first view to the second. Without this change, a highlight would look like a wrong pose, because it moves over its
     # surface with the camera
-    g, eyes = scene.gaussians, scene.cameras.centres.astype(np.float32)
+    g = scene.gaussians
+    eyes = scene.cameras.centres.astype(np.float32)
     expected = np.zeros((len(pairs), max(map(len, greys))), np.float32)
     for expected_greys, (first, second) in zip(expected, pairs, strict=True):
         count = len(ids[first])
@@ -233,10 +244,13 @@ def _improve_poses(level: _PhotoLevel, viewmats: np.ndarray, *, check: bool) -> 
         evidence = _gather_evidence(level, viewmats)
         if step == max_steps or (check and step == 1 and _view_flows(level, evidence).max() < right_px):
             break
-        curvature, slope = np.diag(prior), prior * motion_vectors(level.first_viewmats, viewmats).ravel()
+        curvature = np.diag(prior)
+        slope = prior * motion_vectors(level.first_viewmats, viewmats).ravel()
         pairs = zip(level.pairs.tolist(), evidence.curvatures, evidence.slopes, strict=True)
         for (view, other), pair_curvature, pair_slope in pairs:
-            a, b = slice(6 * view, 6 * view + 6), slice(6 * other, 6 * other + 6)  # the motions of both views
+            # the motions of both views
+            a = slice(6 * view, 6 * view + 6)
+            b = slice(6 * other, 6 * other + 6)
             for rows, columns, sign in ((a, a, 1), (b, b, 1), (a, b, -1), (b, a, -1)):
                 curvature[rows, columns] += sign * pair_curvature
             slope[a] -= pair_slope
@@ -256,7 +270,8 @@ def _gather_evidence(level: _PhotoLevel, viewmats: np.ndarray) -> _Evidence:
 
     def compare_pairs(begin: int) -> None:
         """Fill the evidence of a few pairs, from number ``begin`` on."""
-        scratch, scratch_ids = np.empty((SCRATCH_COLUMNS, max_points)), np.empty(max_points, np.int64)
+        scratch = np.empty((SCRATCH_COLUMNS, max_points))
+        scratch_ids = np.empty(max_points, np.int64)
         compare_views(
             level.points, level.greys, level.starts, level.pairs, viewmats, level.first_viewmats, level.Ks,
             level.pictures, level.depths, NEAR_PLANE, BORDER, level.scale, begin, min(begin + TOGETHER, count),

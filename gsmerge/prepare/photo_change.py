@@ -33,9 +33,11 @@ class PhotoChange:
         if self.tones is not None:
             photo = map_tones(self.tones, photo)
         if self.cover is not None and self.colors is not None:
-            cover, colors = self.cover, self.colors
+            cover = self.cover
+            colors = self.colors
             if cover.shape != photo.shape[:2]:
-                cover, colors = _enlarge(cover, photo.shape) > 0, _enlarge(colors, photo.shape)
+                cover = _enlarge(cover, photo.shape) > 0
+                colors = _enlarge(colors, photo.shape)
             if self.keeps_brightness:
                 colors = (colors + ((photo - colors) * LUMA).sum(-1, keepdims=True)).clip(0, 1)
             photo = np.where(cover[..., None], colors, photo)

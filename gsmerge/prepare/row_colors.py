@@ -114,9 +114,11 @@ def _blend_layers(layers: Scene, colors: np.ndarray) -> tuple[np.ndarray, np.nda
     layer_colors = colors[rows].astype(np.float32)
     if len(layers) == 1:
         return layer_colors[0], opacities[0]
-    means, shape = layers.gaussians.means[rows].astype(np.float64), rows.shape
+    means = layers.gaussians.means[rows].astype(np.float64)
+    shape = rows.shape
     order = np.argsort(camera_depths(means, layers.cameras.viewmats[0]), axis=0, kind="stable")
-    transmittance, total = np.ones(shape[1:], np.float32), np.zeros((*shape[1:], 3), np.float32)
+    transmittance = np.ones(shape[1:], np.float32)
+    total = np.zeros((*shape[1:], 3), np.float32)
     for layer in order:
         weight = transmittance * np.take_along_axis(opacities, layer[None], 0)[0]
         total += weight[..., None] * np.take_along_axis(layer_colors, layer[None, ..., None], 0)[0]

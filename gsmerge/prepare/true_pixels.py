@@ -38,7 +38,8 @@ LOW_PASS = math.sqrt(EPS2D)  # standard deviation of the low-pass, pixels
 # The low-pass hides a Gaussian whose scales are all below the share HIDDEN_SIZE of the low-pass. If at most the share
 # FEWEST_HIDDEN of the Gaussians is hidden, nothing changes, because a fit repairs such a small share. In sound scenes
 # seen from placed cameras, the low-pass hides up to .05 of the Gaussians
-HIDDEN_SIZE, FEWEST_HIDDEN = 0.5, 0.1
+HIDDEN_SIZE = 0.5
+FEWEST_HIDDEN = 0.1
 
 
 def with_pixels(scene: SceneT) -> SceneT:
@@ -54,7 +55,9 @@ def raise_sizes(scene: SceneT, *, placed: bool = False) -> tuple[SceneT, str]:
     compared with the distance to the nearest Gaussian instead of a pixel. Without photos, nothing changes in a scene
     that is drawn antialiased, because there the low-pass makes small Gaussians fainter instead of hiding their size.
     """
-    g, cameras, by_distance = scene.gaussians, scene.cameras, placed and len(scene.gaussians) > 1
+    g = scene.gaussians
+    cameras = scene.cameras
+    by_distance = placed and len(scene.gaussians) > 1
     if cameras.antialiased and scene.images is None:
         return scene, ""
     homes = np.full(len(g), -1) if scene.pixels is None else scene.pixels.homes
@@ -65,13 +68,15 @@ def raise_sizes(scene: SceneT, *, placed: bool = False) -> tuple[SceneT, str]:
     if (g.scales[::step].max(1) < HIDDEN_SIZE * LOW_PASS * units).mean() < FEWEST_HIDDEN:
         return scene, ""
     units = find_nearest(g.means, 1)[1][:, 0] if by_distance else measure_pixel_sizes(g.means, homes, cameras)
-    sizes, seen = g.scales.max(1), (homes >= 0) | by_distance
+    sizes = g.scales.max(1)
+    seen = (homes >= 0) | by_distance
     num_sharing = 1 if by_distance else np.where(seen, np.bincount(homes + 1)[homes + 1], 1)
     is_near = units < 1  # sizes are not compared with pixels as large as the scene's median depth, or larger
     hidden = (sizes * np.sqrt(num_sharing) < HIDDEN_SIZE * LOW_PASS * units) & is_near
     if np.count_nonzero(hidden & seen) <= FEWEST_HIDDEN * np.count_nonzero(seen):
         return scene, ""
-    share, usual = 100 * hidden.mean(), np.median(sizes[hidden] / units[hidden])
+    share = 100 * hidden.mean()
+    usual = np.median(sizes[hidden] / units[hidden])
     change = (
         f"{share:.0f} % of the Gaussians are far smaller than"
         f" {'the distance to the next one' if by_distance else 'a pixel of the views'}, about {usual:.1g} of it;"
@@ -89,12 +94,16 @@ def find_pixels(scene: Scene) -> Pixels:
     front of a pixel is the Gaussian with the largest opacity x transmittance among those with a centre in the pixel. A
     pixel that contains no centre has the front of the cell around it, or -1 if the cell is empty.
     """
-    g, cameras, count = scene.gaussians, scene.cameras, len(scene)
+    g = scene.gaussians
+    cameras = scene.cameras
+    count = len(scene)
     means, scales, opacities = (np.ascontiguousarray(column, np.float32) for column in (g.means, g.scales, g.opacities))
     viewmats, Ks = (np.ascontiguousarray(array, np.float64) for array in (cameras.viewmats, cameras.Ks))
-    height, width = cameras.height, cameras.width
+    height = cameras.height
+    width = cameras.width
     fronts = np.empty((count, height, width), np.int32)
-    best_weights, homes = np.zeros(len(g), np.float32), np.full(len(g), -1, np.int64)
+    best_weights = np.zeros(len(g), np.float32)
+    homes = np.full(len(g), -1, np.int64)
 
     def weigh(view: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Fill the fronts of a view; return the rows ``[m]`` of its Gaussians, their pixels and their weights."""
@@ -103,12 +112,14 @@ def find_pixels(scene: Scene) -> Pixels:
         if len(ids) == 0:
             fronts[view] = -1
             return ids, pixels, areas
-        inside, shown = areas > 0, np.zeros(shape, bool)
+        inside = areas > 0
+        shown = np.zeros(shape, bool)
         shown.reshape(-1)[pixels[inside]] = True
         some_areas = areas[:: max(1, len(areas) // ESTIMATE_GAUSSIANS)]
         level = choose_level(shown, SHOWN_WIDTH * float(np.sqrt(np.median(np.abs(some_areas)))))
         # first the fronts of all cells, then the fronts of pixels from the Gaussians on the surface of their cell
-        order, (cells, cells_shape) = depth_order(depths), _cells_of(pixels, shape, level)
+        order = depth_order(depths)
+        cells, cells_shape = _cells_of(pixels, shape, level)
         grid_fronts = np.empty(cells_shape, np.int32)
         weights = weigh_centres(order, ids, cells, areas, opacities, grid_fronts)  # fills `grid_fronts`
         cell_fronts = grid_fronts.reshape(-1)
@@ -135,14 +146,16 @@ def choose_level(shown: np.ndarray, widest: float) -> int:
     examined. The result is one level above the smallest cells that are wide enough, so that hidden surfaces do not show
     through where a centre is missing. The result is 1 if no cells of up to ``widest`` pixels are wide enough.
     """
-    fine, level = shown, 0
+    fine = shown
+    level = 0
     while 2**level <= max(widest, 1.0):
         around = cv2.erode(_coarser(fine).astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=1) > 0
         height, width = fine.shape
         between = around.repeat(2, 0)[:height].repeat(2, 1)[:, :width]
         if between.any() and np.count_nonzero(fine & between) >= COVERED_CELLS * np.count_nonzero(between):
             return level + 1
-        fine, level = _coarser(fine), level + 1
+        fine = _coarser(fine)
+        level = level + 1
     return 1
 
 
