@@ -93,7 +93,8 @@ def source_files() -> list[Path]:
 
 def hash_sources() -> str:
     """Return a hash of the names and contents of all sources, or an empty string without sources."""
-    digest, paths = hashlib.sha256(), source_files()
+    digest = hashlib.sha256()
+    paths = source_files()
     for path in paths:
         digest.update(path.name.encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()[:16] if paths else ""
@@ -121,7 +122,8 @@ def build_target(
 
     Raises OSError with the message of the compiler if it fails.
     """
-    command, path = compiler(), folder / platform.library_name(target)
+    command = compiler()
+    path = folder / platform.library_name(target)
     is_zig = Path(command[0]).stem == "zig"
     options = ["-target", platform.triple, *platform.flags, *target.zig] if is_zig else target.gcc
     with tempfile.TemporaryDirectory() as cache:

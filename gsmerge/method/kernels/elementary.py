@@ -48,9 +48,11 @@ def _make_function(name: str, doc: str, arguments: tuple[str, ...] = ("values",)
             return single[0]
         dtypes = [a.dtype for a in arrays if isinstance(a, (np.ndarray, np.generic))]
         out_dtype = np.result_type(*dtypes, np.float32) if dtypes else np.dtype(np.float64)
-        compute, dtype = of_doubles, np.dtype(np.float64)
+        compute = of_doubles
+        dtype = np.dtype(np.float64)
         if of_floats is not None and out_dtype == np.float32:
-            compute, dtype = of_floats, out_dtype
+            compute = of_floats
+            dtype = out_dtype
         typed = [np.asarray(a, dtype) for a in arrays]
         shape = np.broadcast_shapes(*(a.shape for a in typed))
         flat = [np.ascontiguousarray(a if a.shape == shape else np.broadcast_to(a, shape)).reshape(-1) for a in typed]
@@ -59,7 +61,9 @@ def _make_function(name: str, doc: str, arguments: tuple[str, ...] = ("values",)
         return out.astype(out_dtype, copy=False)[()]  # [()] makes a scalar of an array without axes
 
     parameters = [inspect.Parameter(key, inspect.Parameter.POSITIONAL_ONLY) for key in arguments]
-    function.__name__, function.__qualname__, function.__doc__ = name, name, doc
+    function.__name__ = name
+    function.__qualname__ = name
+    function.__doc__ = doc
     function.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     return function
 

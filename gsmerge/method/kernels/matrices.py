@@ -42,11 +42,14 @@ def _to_float64(*arrays: ArrayLike) -> tuple[list[Array], np.dtype[Any]]:
 def matmul(a: ArrayLike, b: ArrayLike) -> Array:
     """Multiply matrices ``[...,i,j]`` and ``[...,j,k]``, or vectors ``[j]``, as ``a @ b`` does."""
     (left, right), dtype = _to_float64(a, b)
-    left_is_vector, right_is_vector = left.ndim == 1, right.ndim == 1
-    left, right = left[None] if left_is_vector else left, right[:, None] if right_is_vector else right
+    left_is_vector = left.ndim == 1
+    right_is_vector = right.ndim == 1
+    left = left[None] if left_is_vector else left
+    right = right[:, None] if right_is_vector else right
     stack = left.shape[:-2]  # shape of the axes before the matrices
     if right.ndim == 2:  # all matrices on the left are multiplied with this one, so they form a single tall matrix
-        a_list, b_list = left.reshape(1, math.prod(left.shape[:-1]), left.shape[-1]), right[None]
+        a_list = left.reshape(1, math.prod(left.shape[:-1]), left.shape[-1])
+        b_list = right[None]
     else:
         if stack != right.shape[:-2]:
             stack = np.broadcast_shapes(stack, right.shape[:-2])

@@ -47,7 +47,8 @@ def convolve(picture: Picture, across: np.ndarray, down: np.ndarray) -> Picture:
     height, width, channels = layers.shape
     taps = [np.ascontiguousarray(values, np.float32) for values in (across, down)]
     padded = np.empty((width + len(taps[0]) - 1) * channels, np.float32)
-    rows, out = np.empty((height + len(taps[1]) - 1, width, channels), np.float32), np.empty_like(layers)
+    rows = np.empty((height + len(taps[1]) - 1, width, channels), np.float32)
+    out = np.empty_like(layers)
     _filter_picture(layers, *taps, padded, rows, out)
     return out.reshape(source.shape)
 
@@ -77,9 +78,12 @@ def compare_windows(first: Picture, second: Picture, sigma: float, size: int, c1
     """
     # Variances are small differences of large numbers, for which float32 is exact enough if values are centred at 0
     x, y = (np.ascontiguousarray(picture, np.float32) - np.float32(0.5) for picture in (first, second))
-    (height, width, channels), inner_width = x.shape, x.shape[1] - size + 1
-    row, across = np.empty(2 * width * channels, np.float32), np.empty((4, height, inner_width, channels), np.float32)
-    means, out = np.empty_like(across[:, 0]), np.empty_like(across[0, size - 1 :])
+    height, width, channels = x.shape
+    inner_width = x.shape[1] - size + 1
+    row = np.empty(2 * width * channels, np.float32)
+    across = np.empty((4, height, inner_width, channels), np.float32)
+    means = np.empty_like(across[:, 0])
+    out = np.empty_like(across[0, size - 1 :])
     taps = _gaussian_taps(sigma, size).astype(np.float32)
     _compare_windows(x, y, taps, c1, c2, row, across, means, out)
     return out
@@ -98,7 +102,8 @@ def sample_bilinear(picture: Picture, x: np.ndarray, y: np.ndarray) -> Picture:
     """
     source: Picture = np.ascontiguousarray(picture, np.float32)
     layers = source.reshape(source.shape if source.ndim == 3 else (*source.shape, 1))
-    x, y = np.ascontiguousarray(x, np.float32), np.ascontiguousarray(y, np.float32)
+    x = np.ascontiguousarray(x, np.float32)
+    y = np.ascontiguousarray(y, np.float32)
     out = np.empty((x.size, layers.shape[2]), np.float32)
     _sample_picture(layers, x.reshape(-1), y.reshape(-1), out)
     return out.reshape(*x.shape, *source.shape[2:])
@@ -115,7 +120,8 @@ def enlarge(picture: Picture, width: int, height: int, *, periodic: bool = False
         centres = (np.arange(size) + 0.5) * (old / size) - 0.5  # centres of the new pixels, in old pixels
         # The four old pixels around each new pixel, and their weights. At the ends of a line, indices may be below 0 or
         # above the last pixel
-        floors, taps = np.floor(centres).astype(np.int64), np.arange(-1, 3)[:, None]
+        floors = np.floor(centres).astype(np.int64)
+        taps = np.arange(-1, 3)[:, None]
         distances = np.abs(centres - floors - taps)
         a = -0.75  # slope parameter of the cubic convolution (Keys 1981), the same as in OpenCV
         inner = ((a + 2) * distances - (a + 3)) * distances * distances + 1
@@ -156,9 +162,13 @@ def count_bars(image: np.ndarray, spread: float) -> tuple[int, int, int, int]:
     """
     counts = []
     for lines in (image, image[::-1], image.swapaxes(0, 1), image.swapaxes(0, 1)[::-1]):
-        low, high, count, half = np.inf, -np.inf, 0, len(lines) // 2
+        low = np.inf
+        high = -np.inf
+        count = 0
+        half = len(lines) // 2
         for line in lines[:half]:
-            low, high = min(low, float(line.min())), max(high, float(line.max()))
+            low = min(low, float(line.min()))
+            high = max(high, float(line.max()))
             if high - low > spread:
                 break
             count += 1

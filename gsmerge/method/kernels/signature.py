@@ -180,7 +180,8 @@ class Table:
     """Declaration of a struct of the native library: addresses of arrays, named sizes, and numbers, 8 bytes each."""
 
     def __init__(self, name: str, numbers: tuple[str, ...], **arrays: Argument) -> None:
-        self.name, self.arrays = name, arrays
+        self.name = name
+        self.arrays = arrays
         self.fields = {key: i for i, key in enumerate((*arrays, *size_names(arrays), *numbers))}
 
 
@@ -239,7 +240,8 @@ def _convert_argument(name: str, key: str, argument: Argument, value: Any, sizes
         return value
     if value is None and argument.optional:
         return None
-    dtype, shape = argument.dtype, argument.shape
+    dtype = argument.dtype
+    shape = argument.shape
     if type(value) is not np.ndarray or (value.dtype is not dtype and value.dtype != dtype) or value.ndim != len(shape):
         raise ValueError(f"{name}: {key}: expected {argument}, got {_describe(value)}")
     for size, length in zip(shape, value.shape, strict=True):

@@ -67,7 +67,8 @@ def leader_clusters(order, neighbors, scores, views, threshold, max_size):
         max_size: Largest number of Gaussians in a cluster, with the leader.
     """
     n, k = neighbors.shape
-    clusters, count = np.empty(n, np.int64), np.zeros(1, np.int64)
+    clusters = np.empty(n, np.int64)
+    count = np.zeros(1, np.int64)
     _find_stars(neighbors, scores, views, order, threshold, max_size, np.empty(k), clusters, count)
     return clusters, int(count[0])
 

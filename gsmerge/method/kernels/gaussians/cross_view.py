@@ -33,7 +33,9 @@ def make_tree(points):
     """Return order, axes and splits of the k-d tree of finite ``points [n,3]`` in C order, see :func:`build_tree`."""
     leaf = 16  # runs of at most this many points are not divided
     nodes = 4 << (len(points) // leaf).bit_length()
-    order, axes, splits = np.arange(len(points)), np.zeros(nodes, np.int8), np.zeros(nodes)
+    order = np.arange(len(points))
+    axes = np.zeros(nodes, np.int8)
+    splits = np.zeros(nodes)
     build_tree(points, order, axes, splits)
     return order, axes, splits
 

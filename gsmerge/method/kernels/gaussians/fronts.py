@@ -57,7 +57,8 @@ def weigh_centres(order, ids, pixels, areas, opacities, fronts):
     Returns:
         Opacity times transmittance times area ``[m]`` float32, and 0 for Gaussians that are not in ``order``.
     """
-    weights, passing = np.zeros(len(ids), np.float32), np.ones(fronts.shape, np.float32)
+    weights = np.zeros(len(ids), np.float32)
+    passing = np.ones(fronts.shape, np.float32)
     fronts[:] = -1
     _weigh_centres(order, ids, pixels, areas, opacities, passing, np.zeros_like(passing), fronts, weights)
     return weights

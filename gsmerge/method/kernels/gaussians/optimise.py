@@ -11,8 +11,14 @@ from gsmerge.method.kernels.signature import STATUS, f4, f8, i4, i8, native, u1
 
 # First columns of mean, log scale, quaternion, logit of the opacity and colour in the parameters, and number of all
 # columns
-MEAN, SIZE, QUAT, LOGIT, COLOR, COLUMNS = 0, 3, 6, 10, 11, 14
-MAX_FIT_LOGIT, MIN_FIT_LOGIT = np.float32(6.9), np.float32(-5.5)
+MEAN = 0
+SIZE = 3
+QUAT = 6
+LOGIT = 10
+COLOR = 11
+COLUMNS = 14
+MAX_FIT_LOGIT = np.float32(6.9)
+MIN_FIT_LOGIT = np.float32(-5.5)
 NUM_EDGES = 4  # edges of a photo
 
 

@@ -60,7 +60,8 @@ def agglomerate(
         pairs: ``[n,2]`` int32, written from each cell's start on: the row that gets the merged Gaussian, and the other.
         costs: ``[n]`` float32 costs of the merges, written from each cell's start on. Other entries do not change.
     """
-    work, spare = np.empty((WORK, CELL), np.float32), np.empty((3, CELL), np.int32)
+    work = np.empty((WORK, CELL), np.float32)
+    spare = np.empty((3, CELL), np.int32)
     _agglomerate(
         means, covars, masses, weights, colors, order, starts, color_weight, least_share, first, last, work, spare,
         pairs, costs,

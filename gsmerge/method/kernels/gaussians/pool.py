@@ -22,7 +22,8 @@ def group_members(labels, count):
         labels: ``[n]`` int32, below ``count``.
         count: Number of labels.
     """
-    starts, ids = np.empty(count + 1, np.int64), np.empty(len(labels), np.int32)
+    starts = np.empty(count + 1, np.int64)
+    ids = np.empty(len(labels), np.int32)
     _sort_labels(labels, starts, ids)
     return starts, ids[: starts[-1]]
 
@@ -75,7 +76,8 @@ def split_errors(starts, ids, means, sh0, opacities, centres, footprints, max_ch
     opaque members weigh more.
     """
     num_groups = len(starts) - 1
-    counts, errors = np.full(num_groups, max_children, np.int64), np.full((num_groups, max_children), np.nan)
+    counts = np.full(num_groups, max_children, np.int64)
+    errors = np.full((num_groups, max_children), np.nan)
     _split_into_children(starts, ids, means, sh0, opacities, centres, footprints, counts, errors, plane_weight)
     return errors
 
@@ -84,9 +86,13 @@ def _split_into_children(starts, ids, means, sh0, opacities, centres, footprints
     """Return the result of :func:`bisect`, and write an error for each number of children to ``errors [g, any]``."""
     sizes = np.diff(starts)
     counts = np.minimum(counts, np.maximum(sizes, 1))
-    longest, most, total = int(sizes.max(initial=0)), int(counts.max(initial=1)), int(counts.sum())
-    child_starts, parents = np.empty(total + 1, np.int64), np.empty(total, np.int64)
-    child_ids, num_children = np.empty(starts[-1] - starts[0], np.int32), np.empty(1, np.int64)
+    longest = int(sizes.max(initial=0))
+    most = int(counts.max(initial=1))
+    total = int(counts.sum())
+    child_starts = np.empty(total + 1, np.int64)
+    parents = np.empty(total, np.int64)
+    child_ids = np.empty(starts[-1] - starts[0], np.int32)
+    num_children = np.empty(1, np.int64)
     _split_groups(
         starts, np.asarray(ids, np.int32), means, sh0, opacities, centres, footprints, counts, plane_weight,
         np.empty((longest, 8)), np.empty(longest), np.empty((2, longest), np.int64), np.empty(most + 1, np.int64),

@@ -59,7 +59,9 @@ def scratch_size(tokens: int, width: int) -> int:
 def pack_weights(weight: np.ndarray, bias: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return weights ``[outputs,inputs]`` and a bias ``[outputs]`` in blocks of sixteen outputs, padded with zeros."""
     outputs, inputs = weight.shape
-    padded_weight, padded_bias = np.zeros((padded(outputs), inputs), np.float32), np.zeros(padded(outputs), np.float32)
-    padded_weight[:outputs], padded_bias[:outputs] = weight, bias
+    padded_weight = np.zeros((padded(outputs), inputs), np.float32)
+    padded_bias = np.zeros(padded(outputs), np.float32)
+    padded_weight[:outputs] = weight
+    padded_bias[:outputs] = bias
     blocks = padded_weight.reshape(-(-outputs // VECTOR_LANES), VECTOR_LANES, inputs).swapaxes(1, 2)
     return np.ascontiguousarray(blocks), padded_bias.reshape(-1, VECTOR_LANES)

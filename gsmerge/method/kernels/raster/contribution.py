@@ -20,7 +20,10 @@ from gsmerge.method.kernels.signature import STATUS, f4, f8, i4, i8, native
 FIRST_PAIRS = 1 << 16  # room for this many pairs at the start
 PAIR = 3  # columns of a pair: label, sum, and the next pair of the Gaussian or -1
 # Positions in `counts` of the number of pairs, the number of Gaussians with pairs, and the next tile. Then its length
-NUM_PAIRS, NUM_ACTIVE, NEXT_TILE, PAIR_COUNTS = 0, 1, 2, 3
+NUM_PAIRS = 0
+NUM_ACTIVE = 1
+NEXT_TILE = 2
+PAIR_COUNTS = 3
 
 
 @native(
@@ -54,11 +57,18 @@ def dominant_labels(conics, flatten_ids, isect_offsets, tile_width, labels, coun
     Args:
         labels: ``[h,w]`` int32, below ``count``.
     """
-    num, last_line = len(conics), -(-labels.shape[0] // TILE) - 1  # lines of tiles
-    values, owners = np.zeros(num, np.float32), np.full(num, -1, np.int32)
+    # lines of tiles
+    num = len(conics)
+    last_line = -(-labels.shape[0] // TILE) - 1
+    values = np.zeros(num, np.float32)
+    owners = np.full(num, -1, np.int32)
     # Scratch for superpixels, then the first pair of each Gaussian, the Gaussians with pairs, and `counts`
-    stamps, totals, seen = np.full(count, -1, np.int32), np.zeros(count), np.empty(count, np.int32)
-    heads, active, counts = np.full(num, -1, np.int32), np.empty(num + 1, np.int32), np.zeros(PAIR_COUNTS, np.int64)
+    stamps = np.full(count, -1, np.int32)
+    totals = np.zeros(count)
+    seen = np.empty(count, np.int32)
+    heads = np.full(num, -1, np.int32)
+    active = np.empty(num + 1, np.int32)
+    counts = np.zeros(PAIR_COUNTS, np.int64)
     pairs = np.empty((FIRST_PAIRS, PAIR))
     for line in range(last_line + 1):
         while counts[NEXT_TILE] < (line + 1) * tile_width:

@@ -35,7 +35,8 @@ def list_weights(conics, flatten_ids, isect_offsets, tile_width, height, width):
         pixels and the weights of the entries. Pixels are uint8, and are numbered row by row within the tile. Weights
         are float32.
     """
-    starts, progress = np.zeros(len(flatten_ids) + 1, np.int64), np.zeros(2, np.int64)
+    starts = np.zeros(len(flatten_ids) + 1, np.int64)
+    progress = np.zeros(2, np.int64)
     first_entries = 40  # room for this many entries for each pixel at the start
     lanes, weights = (
         np.empty(max(BATCH_ENTRIES, first_entries * height * width), dtype) for dtype in (np.uint8, np.float32)

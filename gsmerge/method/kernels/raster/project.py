@@ -27,8 +27,21 @@ CONIC = 8  # numbers of a conic: mean_x, mean_y, rate_x, slope, rate_y, lnop, fi
 SUMS = 9
 
 # Positions of numbers in the array of a camera
-ROTATION, SHIFT, FX, FY, CX, CY, WIDTH, HEIGHT, NEAR, FAR, EPS2D = 0, 9, 12, 13, 14, 15, 16, 17, 18, 19, 20
-LIMIT_X, LIMIT_Y, ANTIALIASED = 21, 23, 25  # further positions, where a limit has two numbers
+ROTATION = 0
+SHIFT = 9
+FX = 12
+FY = 13
+CX = 14
+CY = 15
+WIDTH = 16
+HEIGHT = 17
+NEAR = 18
+FAR = 19
+EPS2D = 20
+# further positions, where a limit has two numbers
+LIMIT_X = 21
+LIMIT_Y = 23
+ANTIALIASED = 25
 CAMERA = 26  # length of the array of a camera
 BLOCK = 128  # gradients of the pose are summed over blocks of this many Gaussians
 POSE = 12  # numbers of a world-to-camera matrix: rotation (9, row by row), shift (3)

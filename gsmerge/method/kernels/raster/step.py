@@ -20,11 +20,17 @@ from gsmerge.method.kernels.raster.project import CAMERA, CONIC, POSE, SUMS
 from gsmerge.method.kernels.signature import STATUS, Table, f4, i2, i4, i8, native, u1, u8
 
 WINDOW_SIDE = 7  # side of the windows, pixels
-C1, C2 = np.float32(1e-4), np.float32(9e-4)  # constants of SSIM for values from 0 to 1
+# constants of SSIM for values from 0 to 1
+C1 = np.float32(1e-4)
+C2 = np.float32(9e-4)
 
-DERIVATIVE_ROWS, TERMS = 12, 3  # number of rows of derivatives in memory, and of derivatives for each value
+# number of rows of derivatives in memory, and of derivatives for each value
+DERIVATIVE_ROWS = 12
+TERMS = 3
 EDGE_ROWS = 7  # number of rows in memory for differences between neighbouring pixels
-SUM_CHUNK, PAD = 96, 9  # number of values that are summed at a time, and of zeros beside a row
+# number of values that are summed at a time, and of zeros beside a row
+SUM_CHUNK = 96
+PAD = 9
 
 # Phases of a step. If most Gaussians of a view are hidden, "count_open" follows "count", and "deal_open" replaces
 # "deal". A list that "deal_open" makes ends at the last visible Gaussian of the tile

@@ -49,7 +49,8 @@ def hexagonal_seeds(height, width, count):
     num_rows = min(max(round(height / row_distance), math.ceil(count / width)), height, count)
     row_starts = np.arange(num_rows + 1) * count // num_rows
     row = np.repeat(np.arange(num_rows), np.diff(row_starts))
-    column, row_length = np.arange(count) - row_starts[row], np.diff(row_starts)[row]
+    column = np.arange(count) - row_starts[row]
+    row_length = np.diff(row_starts)[row]
     y = (2 * row + 1) * height // (2 * num_rows)
     x = (column + np.where(row % 2 == 0, 0.25, 0.75)) * width / row_length
     return np.stack([y, x.astype(np.int64)], 1)
@@ -100,7 +101,8 @@ def seeds_from_density(density, count):
         candidates = np.flatnonzero(seeds == (surplus > 0))
         weights = np.ones(len(candidates)) if surplus > 0 else density.reshape(-1)[candidates] + 1e-9
         # different candidates, at equal steps of the cumulative sum of their weights
-        total, order = np.cumsum(weights), np.arange(abs(surplus))
+        total = np.cumsum(weights)
+        order = np.arange(abs(surplus))
         picks = np.searchsorted(total, (order + 0.5) * (total[-1] / len(order)))
         picks = np.maximum.accumulate(picks - order) + order
         picks = np.minimum(picks, len(weights) - len(order) + order)

@@ -12,7 +12,10 @@ import numpy as np
 
 from gsmerge.method.kernels.signature import STATUS, declare, f4, f8, i4, i8, u1
 
-TREE_PIXELS, PLANE_ERROR, TREE_COLUMNS = 5, 15, 20  # columns of number of pixels and plane's error, row length
+# columns of number of pixels and plane's error, row length
+TREE_PIXELS = 5
+PLANE_ERROR = 15
+TREE_COLUMNS = 20
 OVERSIZE = 1e9  # added to the cost of a merge that makes too large a region, so that such merges come last
 
 
@@ -67,13 +70,19 @@ def merge_order(pairs, rows, depth_weight, compactness, max_extent):
         of each merge. Children come before their parents. The height of a merge is its cost, or the largest height of
         its children if that is larger. The growth is the increase of the error of colour and depth.
     """
-    num_nodes, num_pairs = len(rows), len(pairs)
-    num_leaves, last = num_nodes // 2, max(num_nodes - 1, 0)
+    num_nodes = len(rows)
+    num_pairs = len(pairs)
+    num_leaves = num_nodes // 2
+    last = max(num_nodes - 1, 0)
     parents, heads, marks = (np.empty(num_nodes, np.int32) for _ in range(3))
-    heights, growths, costs = np.empty(num_nodes), np.empty(num_nodes), np.empty(num_pairs)
+    heights = np.empty(num_nodes)
+    growths = np.empty(num_nodes)
+    costs = np.empty(num_pairs)
     # Scratch for the pairs of each region, and for a heap of all pairs by their costs
-    nexts, ends = np.empty(2 * num_pairs, np.int32), np.empty(2 * num_pairs, np.int32)
-    heap, places = np.empty(num_pairs, np.int32), np.empty(num_pairs, np.int32)
+    nexts = np.empty(2 * num_pairs, np.int32)
+    ends = np.empty(2 * num_pairs, np.int32)
+    heap = np.empty(num_pairs, np.int32)
+    places = np.empty(num_pairs, np.int32)
     _merge_order(
         num_leaves, pairs, rows, depth_weight, compactness, max_extent, parents, heights, growths, heads, marks,
         nexts, ends, heap, places, costs,
@@ -92,6 +101,8 @@ def cut_labels(parents, keep, num_leaves):
 
     Labels are numbered from 0, in the order of the first leaf of each region.
     """
-    labels, tops, names = np.empty(num_leaves, np.int32), np.empty_like(parents), np.empty_like(parents)
+    labels = np.empty(num_leaves, np.int32)
+    tops = np.empty_like(parents)
+    names = np.empty_like(parents)
     _cut_labels(parents, keep.view(np.uint8), tops, names, labels)
     return labels

@@ -15,8 +15,12 @@ import numpy as np
 
 from gsmerge.method.kernels.signature import COUNT, STATUS, declare, f4, f8, i4, i8, native, u1
 
-NUM_PIXELS, ROW_COLUMNS = 5, 8  # column of the number of pixels, after the means, and length of a row
-LEAVE, JOIN = 6, 7  # columns of n / (n - 1), for a pixel that leaves, and of n / (n + 1), for one that joins
+# column of the number of pixels, after the means, and length of a row
+NUM_PIXELS = 5
+ROW_COLUMNS = 8
+# columns of n / (n - 1), for a pixel that leaves, and of n / (n + 1), for one that joins
+LEAVE = 6
+JOIN = 7
 NUM_BUCKETS = 2048  # number of lists, each for cuts with about the same gain
 NODE = 8  # columns of the row of a rectangle
 
@@ -74,7 +78,8 @@ def split_rectangles(pixels, count, block, compactness):
     """
     height, width, _ = pixels.shape
     capacity = max(count, max(1, height // block) * max(1, width // block))
-    nodes, heads = np.empty((capacity, NODE), np.int32), np.empty(NUM_BUCKETS, np.int64)
+    nodes = np.empty((capacity, NODE), np.int32)
+    heads = np.empty(NUM_BUCKETS, np.int64)
     labels = np.empty((height + 2, width + 2), np.int32)
     return labels, _split_rectangles(integral_image(pixels), count, block, compactness, nodes, heads, labels)
 
@@ -105,7 +110,8 @@ def connectivity_table() -> np.ndarray:
     If the whole ring is in the region, the formula gives 0, although the ring is one part.
     """
     cells = (np.arange(256)[:, None] >> np.arange(8)) & 1
-    edges, corners = cells[:, 0::2], cells[:, 1::2]
+    edges = cells[:, 0::2]
+    corners = cells[:, 1::2]
     joined = edges * corners * np.roll(edges, -1, axis=1)
     return ((edges.sum(1) - joined.sum(1) == 1) | cells.all(1)).astype(np.uint8)
 

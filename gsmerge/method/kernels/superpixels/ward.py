@@ -14,7 +14,9 @@ import numpy as np
 from gsmerge.method.kernels.signature import COUNT, STATUS, declare, f4, i4, i8, u1
 from gsmerge.method.kernels.superpixels.regions import NUM_PIXELS, ROW_COLUMNS, region_rows
 
-INVERSE, MERGE_HEIGHT = 6, 7  # columns of 1 / number of pixels, and of the height of the merge that made a region
+# columns of 1 / number of pixels, and of the height of the merge that made a region
+INVERSE = 6
+MERGE_HEIGHT = 7
 
 
 # Returns the number of pairs
@@ -62,9 +64,11 @@ def merge_tree(pairs, rows, num_leaves, num_merges, ceiling):
         The parent of each leaf and merge, which is -1 at a root, and the number of leaves and merges. Children come
         before their parents.
     """
-    parents, best_costs = np.empty(len(rows), np.int32), np.empty(len(rows), np.float32)
+    parents = np.empty(len(rows), np.int32)
+    best_costs = np.empty(len(rows), np.float32)
     # Costs of the edges, and the edges above the ceiling with their costs
-    costs, parked_costs = np.empty(len(pairs), np.float32), np.empty(len(pairs) + 1, np.float32)
+    costs = np.empty(len(pairs), np.float32)
+    parked_costs = np.empty(len(pairs) + 1, np.float32)
     parked = np.empty((len(pairs) + 1, 2), np.int32)
     num_nodes = _merge_tree(
         num_leaves, num_merges, ceiling, pairs, costs, parked, parked_costs, rows, parents, best_costs
