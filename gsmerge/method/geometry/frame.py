@@ -85,11 +85,13 @@ def scene_depth(scene: Scene) -> float:
     if scene.has_own_pixels:
         homes = scene.get_pixels().homes[rows]
         if homes.min() < 0:
-            means, homes = means[homes >= 0], homes[homes >= 0]
+            means = means[homes >= 0]
+            homes = homes[homes >= 0]
         return float(lower_median(np.abs(camera_depths(means, scene.cameras.viewmats, homes // scene.pixels_per_view))))
     views = scene.cameras[:: max(1, len(scene) // MAX_UNIT_VIEWS)]
     pixels, depths = project(means, views)
-    x, y = pixels[..., 0], pixels[..., 1]
+    x = pixels[..., 0]
+    y = pixels[..., 1]
     seen = (depths > 0) & (x > 0) & (x < views.width) & (y > 0) & (y < views.height)
     return float(lower_median(depths[seen])) if seen.any() else 0.0
 
@@ -106,5 +108,6 @@ def canonicalise(scene: SceneT, frame: Frame | None = None) -> tuple[SceneT, Fra
     """Move a scene into the canonical ``frame``, by default its own; return the scene and the frame."""
     frame = frame or scene_frame(scene)
     region = None if scene.region is None else move_region(scene.region, frame.origin, frame.unit)
-    gaussians, cameras = frame.enter(scene.gaussians), frame.enter_cameras(scene.cameras)
+    gaussians = frame.enter(scene.gaussians)
+    cameras = frame.enter_cameras(scene.cameras)
     return replace(scene, gaussians=gaussians, cameras=cameras, region=region), frame

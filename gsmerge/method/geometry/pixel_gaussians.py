@@ -8,7 +8,9 @@ from gsmerge.method.geometry.transforms import rgb_to_sh0
 from gsmerge.method.kernels.matrices import invert, matmul
 from gsmerge.types import Gaussians
 
-NEW_SIZE_PIXELS, NEW_OPACITY = 0.75, 0.9  # standard deviation in pixels, and opacity, of a new Gaussian
+# standard deviation in pixels, and opacity, of a new Gaussian
+NEW_SIZE_PIXELS = 0.75
+NEW_OPACITY = 0.9
 
 
 def pixel_rays(mask: np.ndarray, K: np.ndarray, viewmat: np.ndarray) -> np.ndarray:

@@ -21,7 +21,10 @@ ROWS_PER_TASK = 4096  # groups that one task pools
 FOOTPRINT_ROWS = 65536  # Gaussians whose footprints one task computes
 # Columns of a group in the output of the kernel `pool`
 POOLED_MEAN, POOLED_COVAR, POOLED_WEIGHT, POOLED_MASS = slice(0, 3), slice(3, 9), 9, 10
-POOLED_EXTINCTION, POOLED_FOOTPRINT, POOLED_COLUMNS = 11, 12, 13  # the last is the number of columns
+# the last is the number of columns
+POOLED_EXTINCTION = 11
+POOLED_FOOTPRINT = 12
+POOLED_COLUMNS = 13
 FULL_MATRIX = [0, 1, 2, 1, 3, 4, 2, 4, 5]  # entries of an upper triangle xx xy xz yy yz zz in a flattened 3 x 3 matrix
 
 
@@ -47,7 +50,8 @@ def _as_float32(values: np.ndarray) -> np.ndarray:
 
 def scene_members(scene: Scene) -> Members:
     """Return the Gaussians of a canonical scene as members, whose footprints are the widths of their pixels."""
-    g, pixels = scene.gaussians, scene.get_pixels()
+    g = scene.gaussians
+    pixels = scene.get_pixels()
     return _make_members(g, measure_pixel_sizes(_as_float32(g.means), pixels.homes, scene.cameras), pixels)
 
 
@@ -124,7 +128,8 @@ def pool_members(members: Members, starts: np.ndarray, ids: np.ndarray, rule: Ru
         )  # fmt: skip
 
     parallel_map(pool_groups, range(0, num_groups, ROWS_PER_TASK))
-    covars, extinctions = pooled[:, POOLED_COVAR][:, FULL_MATRIX].reshape(-1, 3, 3), pooled[:, POOLED_EXTINCTION]
+    covars = pooled[:, POOLED_COVAR][:, FULL_MATRIX].reshape(-1, 3, 3)
+    extinctions = pooled[:, POOLED_EXTINCTION]
     if rule == "paper" and num_groups:
         scales, _ = principal_axes(covars)
         opacities = np.add.reduceat(members.opacities[ids].astype(np.float64), starts[:-1]) / np.diff(starts)

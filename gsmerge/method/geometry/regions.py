@@ -15,7 +15,9 @@ def find_region(crop: str) -> Region:
     numbers = np.array(parsed)
     if shape == "sphere":
         return Region(numbers[:3], np.full(3, numbers[3]), np.eye(3), is_sphere=True)
-    low, high, degrees = numbers[:3], numbers[3:6], np.pad(numbers[6:], (0, 9 - len(numbers)))
+    low = numbers[:3]
+    high = numbers[3:6]
+    degrees = np.pad(numbers[6:], (0, 9 - len(numbers)))
     rotation = euler_to_rotmat(degrees).T if degrees.any() else np.eye(3)
     return Region((low + high) / 2, (high - low) / 2, rotation, is_sphere=False)
 

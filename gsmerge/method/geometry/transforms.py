@@ -24,7 +24,9 @@ DescentState = TypeVar("DescentState")  # state that a descent changes
 SH_DIRECTIONS = 96  # directions in which harmonics are compared before and after a rotation
 # To find the median of more than FEW_VALUES values, only the values between the quantiles AROUND_MEDIAN of a sample are
 # ordered. The sample has about SAMPLE_VALUES values
-FEW_VALUES, SAMPLE_VALUES, AROUND_MEDIAN = 1 << 17, 1 << 14, (0.47, 0.53)
+FEW_VALUES = 1 << 17
+SAMPLE_VALUES = 1 << 14
+AROUND_MEDIAN = (0.47, 0.53)
 NORMAL_SPREAD = 1.4826  # standard deviation of a normal distribution, divided by its median absolute deviation
 NEAREST_ROWS = 1 << 14  # points per task of a search for nearest points
 BRIGHT_SH0 = np.float32(20.0)  # harmonic of degree 0 so large that no colour is clipped at 0
@@ -70,7 +72,8 @@ def rotmat_to_quat(rotations: np.ndarray) -> np.ndarray:
 
 def multiply_quats(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Return the products of quaternions ``[...,4]`` wxyz: first ``b``, then ``a``."""
-    (aw, ax, ay, az), (bw, bx, by, bz) = np.moveaxis(a, -1, 0), np.moveaxis(b, -1, 0)
+    aw, ax, ay, az = np.moveaxis(a, -1, 0)
+    bw, bx, by, bz = np.moveaxis(b, -1, 0)
     product = [
         aw * bw - ax * bx - ay * by - az * bz, aw * bx + ax * bw + ay * bz - az * by,
         aw * by - ax * bz + ay * bw + az * bx, aw * bz + ax * by - ay * bx + az * bw,
@@ -107,7 +110,8 @@ def project_points(points: np.ndarray, viewmats: np.ndarray, Ks: np.ndarray) -> 
 
 def is_inside(pixels: np.ndarray, cameras: Cameras) -> np.ndarray:
     """Return a mask ``[...]`` of the positions ``[...,2]`` (pixels) inside the cameras' pictures."""
-    column, row = pixels[..., 0], pixels[..., 1]
+    column = pixels[..., 0]
+    row = pixels[..., 1]
     return np.asarray((column >= 0) & (column < cameras.width) & (row >= 0) & (row < cameras.height))
 
 
@@ -116,9 +120,13 @@ def camera_depths(points: np.ndarray, viewmats: np.ndarray, ids: np.ndarray | No
 
     If each of ``[n,3]`` points has a camera of its own, ``ids [n]`` are the numbers of these cameras.
     """
-    (x, y, z), (a, b, c, d) = np.moveaxis(points, -1, 0), np.moveaxis(viewmats[..., 2, :], -1, 0)
+    x, y, z = np.moveaxis(points, -1, 0)
+    a, b, c, d = np.moveaxis(viewmats[..., 2, :], -1, 0)
     if ids is not None:
-        a, b, c, d = a[ids], b[ids], c[ids], d[ids]
+        a = a[ids]
+        b = b[ids]
+        c = c[ids]
+        d = d[ids]
     return x * a + y * b + z * c + d
 
 
@@ -290,7 +298,8 @@ def median(values: np.ndarray) -> float:
     if len(values) > FEW_VALUES and not np.isnan(values.min()):
         sample = np.sort(values[:: len(values) // SAMPLE_VALUES])
         low, high = sample[[int(share * (len(sample) - 1)) for share in AROUND_MEDIAN]]
-        near, num_lower = values[(values >= low) & (values <= high)], int(np.count_nonzero(values < low))
+        near = values[(values >= low) & (values <= high)]
+        num_lower = int(np.count_nonzero(values < low))
         middle = len(values) // 2 - num_lower  # index of the median in the ordered values of `near`
         if 0 < middle < len(near):
             ordered = np.partition(near, (middle - 1, middle))
@@ -315,7 +324,8 @@ def quantiles(values: np.ndarray, shares: Sequence[float]) -> np.ndarray:
     before = np.floor(places).astype(np.int64)
     after = np.minimum(before + 1, len(values) - 1)
     ordered = np.partition(values, [*before, *after], axis=0)
-    low, high = ordered[before], ordered[after]
+    low = ordered[before]
+    high = ordered[after]
     steps = (places - before).reshape(-1, *[1] * (values.ndim - 1))
     # start from the nearer of two values, so that results are rounded as by np.quantile
     return np.where(steps < 0.5, low + (high - low) * steps, high - (high - low) * (1 - steps))
@@ -338,7 +348,8 @@ def morton_codes(points: np.ndarray) -> np.ndarray:
     codes = np.zeros(len(points), np.int64)
     if len(points) == 0:
         return codes
-    low, high = points.min(0), points.max(0)
+    low = points.min(0)
+    high = points.max(0)
     axis_bits = 21  # bits for each axis; three axes fit into 63 bits
     steps = (points - low) / np.maximum(high - low, 1e-30) * (2**axis_bits - 1)
     for axis, column in enumerate(steps.astype(np.int64).T):
@@ -435,7 +446,8 @@ def descend(
 
     ``step`` takes a state and the amount of damping, and returns the next state, or None if the step fails.
     """
-    state, amount = start, damping.first
+    state = start
+    amount = damping.first
     least_error = error(state)
     for _ in range(damping.steps):
         trial = step(state, amount)
@@ -448,7 +460,8 @@ def descend(
                 break
             continue
         gain = 1 - trial_error / least_error
-        state, least_error = trial, trial_error
+        state = trial
+        least_error = trial_error
         if gain < damping.min_gain:
             break
         amount *= damping.decrease
@@ -496,7 +509,8 @@ IDENTITY = Similarity(np.eye(3), 1.0, np.zeros(3))
 
 def move_region(region: Region, origin: np.ndarray, unit: float) -> Region:
     """Return a region in a frame with another origin and unit, whose positions are stored in float32."""
-    middle, half = (region.middle - origin) / unit, region.half / unit
+    middle = (region.middle - origin) / unit
+    half = region.half / unit
     float32_rounding = float(np.finfo(np.float32).eps) * float(np.abs(middle).max() + half.max())
     return replace(region, middle=middle, half=half, rounding=region.rounding / unit + float32_rounding)
 
@@ -530,8 +544,10 @@ def fit_similarity(start: np.ndarray, end: np.ndarray, scale: float = 1.0) -> Si
     If all cameras stand in one place, which does not determine the scale, ``scale`` is used.
     """
     rotation = closest_rotation(matmul(end[:, :3, :3].swapaxes(1, 2), start[:, :3, :3]).sum(0))
-    a, b = matmul(camera_centres(start), rotation.T), camera_centres(end)
-    a_offsets, b_offsets = a - a.mean(0), b - b.mean(0)
+    a = matmul(camera_centres(start), rotation.T)
+    b = camera_centres(end)
+    a_offsets = a - a.mean(0)
+    b_offsets = b - b.mean(0)
     spread = float((a_offsets**2).sum())
     if spread > 1e-12 * max(float((a**2).sum()), 1e-300) and len(end) > 1:
         scale = float((a_offsets * b_offsets).sum()) / spread
@@ -540,7 +556,8 @@ def fit_similarity(start: np.ndarray, end: np.ndarray, scale: float = 1.0) -> Si
 
 def mean_pose_frame(viewmats: np.ndarray) -> Similarity:
     """Return the similarity into the mean pose of cameras ``[c,4,4]``, with all centres within +-1, as in Long-LRM."""
-    down, forward = viewmats[:, 1, :3].mean(0), normalize(viewmats[:, 2, :3].mean(0)).astype(np.float64)
+    down = viewmats[:, 1, :3].mean(0)
+    forward = normalize(viewmats[:, 2, :3].mean(0)).astype(np.float64)
     down = normalize(down - (down * forward).sum() * forward)  # now perpendicular to `forward`
     rotation = np.stack([np.cross(down, forward), down, forward])
     centres = camera_centres(viewmats)

@@ -86,7 +86,8 @@ def take_rows(scene: SceneT, rows: np.ndarray) -> SceneT:
     reduced = replace(scene, gaussians=scene.gaussians[rows], filled=filled, pixels=None)
     if not scene.has_own_pixels:
         return reduced
-    pixels, new_rows = scene.get_pixels(), np.full(len(scene.gaussians), -1, np.int32)
+    pixels = scene.get_pixels()
+    new_rows = np.full(len(scene.gaussians), -1, np.int32)
     new_rows[rows] = np.arange(len(rows), dtype=np.int32)
     fronts = np.where(pixels.shown, new_rows[pixels.fronts], np.int32(-1))
     return replace(reduced, pixels=Pixels(pixels.homes[rows], fronts, own=True))

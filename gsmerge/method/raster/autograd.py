@@ -39,7 +39,8 @@ class _Render(torch.autograd.Function):
 
         drawn = draw_views(tile_one, (len(cameras), cameras.height, cameras.width), background, with_depths)
         ctx.views = tiled_views
-        images, alphas = torch.from_numpy(drawn.images), torch.from_numpy(drawn.alphas)
+        images = torch.from_numpy(drawn.images)
+        alphas = torch.from_numpy(drawn.alphas)
         # Save tensors through autograd, which notices if one of them is overwritten before the backward pass
         ctx.save_for_backward(*tensors, images, alphas)
         if drawn.depths is None:

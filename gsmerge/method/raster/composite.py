@@ -28,7 +28,8 @@ def background_color(background: ArrayLike) -> Array:
 
 def view_colors(tiled: TiledView) -> Array:
     """Return the colours ``[m,3]`` that a view's Gaussians show to its camera, clipped at 0."""
-    colors, splats = np.empty((len(tiled.ids), 3), np.float32), tiled.splats
+    colors = np.empty((len(tiled.ids), 3), np.float32)
+    splats = tiled.splats
     with use_threads() as threads:
         parallel_map(
             lambda span: projection.view_colors(
@@ -113,7 +114,8 @@ def survey(tiled: TiledView, colors: Array | None = None) -> tuple[Array, Array,
     weights of each Gaussian of ``tiled.ids``. ``colors [n,3]`` are as in :func:`composite`.
     """
     own_colors = view_colors(tiled) if colors is None else np.ascontiguousarray(colors.take(tiled.ids, 0), np.float32)
-    image, totals = np.empty((tiled.height, tiled.width, 3), np.float32), np.zeros((len(tiled.ids), 2), np.float32)
+    image = np.empty((tiled.height, tiled.width, 3), np.float32)
+    totals = np.zeros((len(tiled.ids), 2), np.float32)
     kernels.survey(*tiled.lists, own_colors, image, totals)
     return image, totals[:, 0], totals[:, 1]
 

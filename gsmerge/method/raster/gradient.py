@@ -68,7 +68,8 @@ def gradients_of(
     view matrix. The gradient of alpha is zero where alpha is clamped at 0.99. Thresholds that decide whether a Gaussian
     is drawn have no gradient.
     """
-    m, splats = len(tiled.ids), tiled.splats
+    m = len(tiled.ids)
+    splats = tiled.splats
     slots = np.empty((len(tiled.flatten_ids), SUMS), np.float32)
     sums = np.zeros((m, SUMS), np.float32)
     means, quats, scales, color_sums = (np.empty((m, size), np.float32) for size in (3, 4, 3, 3))
@@ -104,8 +105,10 @@ def viewmat_gradient(poses: Array, origin: Array) -> Array:
 
     ``poses [blocks,POSE]`` are partial sums of :func:`project_backward`, whose coordinates begin at ``origin [3]``.
     """
-    pose, viewmat = poses.sum(0, dtype=np.float64), np.zeros((4, 4))
-    rotation, shift = pose[:9].reshape(3, 3), pose[9:]
+    pose = poses.sum(0, dtype=np.float64)
+    viewmat = np.zeros((4, 4))
+    rotation = pose[:9].reshape(3, 3)
+    shift = pose[9:]
     viewmat[:3, 3], viewmat[:3, :3] = shift, rotation + np.outer(shift, origin)
     return viewmat
 
@@ -119,10 +122,13 @@ def color_gradients(
     are clipped at 0. ``used`` is an earlier result that is no longer needed. The memory of ``used`` is reused if it has
     the same number of coefficients and enough rows, since new memory costs a quarter of the time or more.
     """
-    m, splats = len(tiled.ids), tiled.splats
+    m = len(tiled.ids)
+    splats = tiled.splats
     shape_N = splats.shN.shape[1:]
     if used is not None and len(used.ids) >= m and used.shN.shape[1:] == shape_N:
-        sh0, shN, means = used.sh0[:m], used.shN[:m], used.means[:m]
+        sh0 = used.sh0[:m]
+        shN = used.shN[:m]
+        means = used.means[:m]
     else:
         sh0, shN, means = (np.empty((m, *shape), np.float32) for shape in ((1, 3), shape_N, (3,)))
     with use_threads() as threads:

@@ -73,7 +73,8 @@ def render(
     if tensors:
         import torch  # only if there are tensors
 
-        gaussians, cameras = gaussians.to("cpu"), cameras.to("cpu")
+        gaussians = gaussians.to("cpu")
+        cameras = cameras.to("cpu")
         moving = (*vars(gaussians).values(), cameras.viewmats)
         needs_gradient = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in moving)
     if needs_gradient:
@@ -113,7 +114,8 @@ def render_in_batches(
         """Return the image, with alpha if there is no background."""
         return image if background is not None else np.concatenate([image, alpha[..., None]], -1)
 
-    lines, band_lines = -(-cameras.height // TILE), max(1, BAND_PIXELS // (cameras.width * TILE))
+    lines = -(-cameras.height // TILE)
+    band_lines = max(1, BAND_PIXELS // (cameras.width * TILE))
     if lines > band_lines:
         bands = [(first_line, min(first_line + band_lines, lines)) for first_line in range(0, lines, band_lines)]
         for view in range(len(cameras)):

@@ -10,9 +10,13 @@ from gsmerge.arrays import Array, as_array
 from gsmerge.method.kernels.elementary import log10
 from gsmerge.method.kernels.pictures import compare_windows
 
-WINDOW, SIGMA = 11, 1.5  # side of the windows of SSIM and their standard deviation, pixels
+# side of the windows of SSIM and their standard deviation, pixels
+WINDOW = 11
+SIGMA = 1.5
 INNER = (slice(WINDOW // 2, -(WINDOW // 2)), slice(WINDOW // 2, -(WINDOW // 2)))  # pixels that are centres of windows
-C1, C2 = 0.01**2, 0.03**2  # stabilisers of SSIM (K1 = .01, K2 = .03) for a data range of 1
+# stabilisers of SSIM (K1 = .01, K2 = .03) for a data range of 1
+C1 = 0.01**2
+C2 = 0.03**2
 MAX_LOSS = 0.5  # dB of PSNR that a result may lose against its input without a warning
 SAMPLE_LOSS = 1.0  # dB by which a loss measured on a sample may be wrong; at most 0.9 dB on fifteen captures
 MAX_PSNR = 120.0  # dB that replace the infinite PSNR of equal pictures
@@ -21,7 +25,8 @@ POOR_PSNR = 30.0  # dB of PSNR between a result and its input, below which their
 
 def image_pair(image: Array, reference: Array) -> tuple[Array, Array]:
     """Convert two images ``[h,w,c]`` to arrays, or raise ValueError if their shapes differ."""
-    first, second = as_array(image), as_array(reference)
+    first = as_array(image)
+    second = as_array(reference)
     if first.ndim != 3 or first.shape != second.shape:
         raise ValueError(f"expected two images [h,w,c] of one shape, got {list(first.shape)} and {list(second.shape)}")
     return first, second

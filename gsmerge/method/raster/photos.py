@@ -29,7 +29,8 @@ ERRORS_ONE_AT_A_TIME = 400_000
 # Scored tiles are shifted by TILE_STEP columns, a prime, from one line of tiles to the next. At least LEAST_TILES of a
 # view are scored, so small views are scored whole. With 48 tiles, a PSNR gain on six views of 256 x 480 pixels seemed
 # 1.0 dB larger than it was
-TILE_STEP, LEAST_TILES = 13, 100
+TILE_STEP = 13
+LEAST_TILES = 100
 MASKED_WEIGHT = np.float32(0.1)  # weight of pixels outside masks; with 0, Gaussians there would drift
 COVERED_TRANSMITTANCE = np.float32(0.5)  # transmittance below which a pixel counts as covered by Gaussians
 WHOLE_SHARE = 0.98  # share of covered pixels from which on the whole view counts as covered
@@ -129,7 +130,9 @@ class Photos:
 
     def camera(self, view: int, sample: Sample = WHOLE_PHOTO) -> dict[str, Any]:
         """Return the arguments of :func:`gsmerge.method.raster.tile_view` for a view's photo, or a sample of it."""
-        K, stride, offset = self.Ks[view], sample.stride, np.array([sample.column, sample.row])
+        K = self.Ks[view]
+        stride = sample.stride
+        offset = np.array([sample.column, sample.row])
         if stride > 1:  # column i of the sample is column stride * i + offset of the photo; both have centres at +0.5
             K = K / np.array([[stride], [stride], [1.0]])
             K[:2, 2] += ((stride - 1) / 2 - offset) / stride
@@ -155,7 +158,8 @@ def row_pictures(scene: Scene) -> np.ndarray:
 
     def draw(view: int) -> None:
         """Write the picture of one view."""
-        fronts, picture = pixels.fronts[view], pictures[view]
+        fronts = pixels.fronts[view]
+        picture = pictures[view]
         np.clip(sh0_to_rgb(sh0.take(fronts, axis=0)), 0, 1, out=picture)
         if (fronts < 0).any():
             picture[fronts < 0] = 0
@@ -220,11 +224,15 @@ def blank_photos(cameras: Cameras, level: float = 1) -> Photos:
 
     The black images take no memory.
     """
-    viewmats, Ks = cameras.viewmats.astype(np.float64), cameras.Ks.astype(np.float64)
-    w, h = cameras.width, cameras.height
-    width, height = max(1, round(w / level)), max(1, round(h / level))
+    viewmats = cameras.viewmats.astype(np.float64)
+    Ks = cameras.Ks.astype(np.float64)
+    w = cameras.width
+    h = cameras.height
+    width = max(1, round(w / level))
+    height = max(1, round(h / level))
     black = np.broadcast_to(np.float32(0), (len(cameras), height, width, 3))
-    sx, sy = width / w, height / h
+    sx = width / w
+    sy = height / h
     return Photos(black, viewmats, Ks * np.array([[sx], [sy], [1.0]]), EPS2D * sx * sy, antialiased=cameras.antialiased)
 
 
@@ -327,7 +335,8 @@ def scored_tiles(view: int, width: int, height: int, every: int) -> np.ndarray |
     One of ``every`` tiles is scored, but at least ``LEAST_TILES`` of a view. The scored tiles are spread evenly, and
     differ from view to view.
     """
-    tile_height, tile_width = -(-height // TILE), -(-width // TILE)
+    tile_height = -(-height // TILE)
+    tile_width = -(-width // TILE)
     every = min(every, tile_height * tile_width // LEAST_TILES)
     if every <= 1:
         return None

@@ -23,9 +23,12 @@ Array = NDArray[Any]
 THREAD_PIECE = 1 << 13  # least number of Gaussians or intersections per thread
 # Least intersections of a crowded view, and least mean intersections per Gaussian. In a crowded view most Gaussians are
 # hidden, so the list of each tile ends at its last visible Gaussian
-CROWDED, CROWDED_EACH = 1 << 24, 16
+CROWDED = 1 << 24
+CROWDED_EACH = 16
 EPS2D = 0.3  # low-pass of the rasterizer, which widens Gaussians; square pixels of the full-size image
-WORLD_NEAR_PLANE, FAR_PLANE = 0.01, math.inf  # depths, world units
+# depths, world units
+WORLD_NEAR_PLANE = 0.01
+FAR_PLANE = math.inf
 # Directions are clamped at SPARE_SHARE of the image's size outside its borders, as in gsplat, because the first-order
 # projection is too inexact farther outside
 SPARE_SHARE = 0.15
@@ -131,8 +134,12 @@ def camera_numbers(
     near: float = WORLD_NEAR_PLANE, far: float = FAR_PLANE,
 ) -> Array:  # fmt: skip
     """Return a camera as an array of float32 numbers, in the order in which the kernels read them."""
-    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
-    spare_x, spare_y = SPARE_SHARE * width / fx, SPARE_SHARE * height / fy
+    fx = K[0, 0]
+    fy = K[1, 1]
+    cx = K[0, 2]
+    cy = K[1, 2]
+    spare_x = SPARE_SHARE * width / fx
+    spare_y = SPARE_SHARE * height / fy
     camera = np.zeros(projection.CAMERA, np.float32)
     camera[projection.ROTATION : projection.SHIFT] = viewmat[:3, :3].ravel()
     camera[projection.SHIFT : projection.FX] = viewmat[:3, 3]
@@ -141,7 +148,8 @@ def camera_numbers(
     camera[projection.LIMIT_X : projection.LIMIT_Y] = (width - cx) / fx + spare_x, -cx / fx - spare_x
     camera[projection.LIMIT_Y : projection.ANTIALIASED] = (height - cy) / fy + spare_y, -cy / fy - spare_y
     camera[projection.ANTIALIASED] = antialiased
-    camera[projection.NEAR], camera[projection.FAR] = near, far
+    camera[projection.NEAR] = near
+    camera[projection.FAR] = far
     return camera
 
 
@@ -168,7 +176,8 @@ def _project(
 
     def cull(span: tuple[int, int]) -> Array:
         """Return the ids of the Gaussians in a range of rows that may touch the image or its chosen tiles."""
-        rows, ids = slice(*span), np.empty(span[1] - span[0], np.int32)
+        rows = slice(*span)
+        ids = np.empty(span[1] - span[0], np.int32)
         keep_rows = None if keep is None else keep[rows]
         count = projection.cull(
             splats.means[rows], splats.scales[rows], opacities[rows], keep_rows, corner_sums, camera, span[0], ids
@@ -209,7 +218,8 @@ def _list_by_tile(order: Array, boxes: Array, conics: Array, wanted: Array, thre
     counts = np.stack(parallel_map(lambda part: count_tiles(boxes[slice(*part)], *wanted.shape), spans))
     if hides_most(int(counts.sum()), len(order)):
         return _list_open_tiles(order, boxes, conics, wanted.shape[0], wanted.shape[1], threads)
-    totals, is_wanted = counts.sum(0), wanted.reshape(-1)
+    totals = counts.sum(0)
+    is_wanted = wanted.reshape(-1)
     isect_offsets = np.concatenate([[0], np.cumsum(totals * is_wanted)])
     # The lists of unwanted tiles are written behind the lists of wanted tiles, and then cut off
     ends = np.where(is_wanted, isect_offsets[1:], isect_offsets[-1] + np.cumsum(totals * ~is_wanted))
@@ -290,7 +300,8 @@ def tile_view(
     The size of the result depends on the number of visible Gaussians, not on n. Raises ValueError if a size or a number
     is out of range.
     """
-    viewmat, K = np.asarray(viewmat, np.float64).copy(), np.asarray(K, np.float64)
+    viewmat = np.asarray(viewmat, np.float64).copy()
+    K = np.asarray(K, np.float64)
     _check_view(viewmat, K, width, height)
     if not (0 < near < far and eps2d >= 0):
         raise ValueError(f"expected 0 < near < far and eps2d >= 0, got {near}, {far} and {eps2d}")
@@ -302,8 +313,11 @@ def tile_view(
     local_viewmat = viewmat.copy()  # from the coordinates of the splats, whose zero is at `splats.origin`
     local_viewmat[:3, 3] += matmul(local_viewmat[:3, :3], splats.origin)
     camera = camera_numbers(local_viewmat, K, width, height, eps2d, antialiased, near, far)
-    tile_width, tile_height = -(-width // projection.TILE), -(-height // projection.TILE)
-    (top, bottom), (left, right) = band or (0, tile_height), columns or (0, tile_width)  # tiles
+    tile_width = -(-width // projection.TILE)
+    tile_height = -(-height // projection.TILE)
+    # tiles
+    top, bottom = band or (0, tile_height)
+    left, right = columns or (0, tile_width)
     is_part = band is not None or columns is not None
     if is_part:
         tiles = np.zeros((tile_height, tile_width), bool)
@@ -318,7 +332,8 @@ def tile_view(
         order = depth_order(depths)
         wanted = np.ones((tile_height, tile_width), bool) if tiles is None else tiles
         flatten_ids, isect_offsets = _list_by_tile(order, boxes, conics, wanted, threads)
-    eye, first_row = camera_centres(local_viewmat).astype(np.float32), top * projection.TILE
+    eye = camera_centres(local_viewmat).astype(np.float32)
+    first_row = top * projection.TILE
     return TiledView(
         splats, ids, conics, depths, flatten_ids, isect_offsets, eye, opacities, camera, viewmat, width,
         min(height, bottom * projection.TILE) - first_row, first_row,
