@@ -47,13 +47,17 @@ class Edges:
 
 def find_edges(cameras: Cameras, count: int) -> Edges:
     """Return the edges of the views of ``cameras``, moved out by ``MARGIN`` for a result of ``count`` Gaussians."""
-    size, num = np.array([cameras.width, cameras.height]), len(cameras)
+    size = np.array([cameras.width, cameras.height])
+    num = len(cameras)
     margin = MARGIN * math.sqrt(num * cameras.width * cameras.height / max(1, count))
-    Ks, viewmats = cameras.Ks.astype(np.float64), cameras.viewmats.astype(np.float64)
-    focals, middles = Ks[:, [0, 1], [0, 1]], Ks[:, :2, 2]
+    Ks = cameras.Ks.astype(np.float64)
+    viewmats = cameras.viewmats.astype(np.float64)
+    focals = Ks[:, [0, 1], [0, 1]]
+    middles = Ks[:, :2, 2]
     left, top = ((-margin - middles) / focals).T
     right, bottom = ((size + margin - middles) / focals).T
-    zeros, ones = np.zeros(num), np.ones(num)
+    zeros = np.zeros(num)
+    ones = np.ones(num)
     sides = (-ones, zeros, left), (ones, zeros, -right), (zeros, -ones, top), (zeros, ones, -bottom)
     camera_normals = np.stack([np.stack(side, 1) for side in sides], 1)  # in the axes of each camera
     camera_normals /= np.sqrt((camera_normals**2).sum(2, keepdims=True))
@@ -66,12 +70,15 @@ def cut_state(state: FitState, edges: Edges) -> None:
 
     After a cut, the box in which a mean may move is centred at the new mean. The limits of the scales do not change.
     """
-    splats, x = state.splats, state.x
+    splats = state.splats
+    x = state.x
     means, covars, is_cut = _compute_cuts(splats, edges)
     rows = np.flatnonzero(is_cut & ~state.fixed)
     scales, quats = principal_axes(covars[rows])
     sizes = np.maximum(log(scales), state.min_sizes[rows, None])
-    x[rows, :SIZE], x[rows, SIZE:QUAT], x[rows, QUAT:LOGIT] = means[rows], sizes, quats
+    x[rows, :SIZE] = means[rows]
+    x[rows, SIZE:QUAT] = sizes
+    x[rows, QUAT:LOGIT] = quats
     state.x0[rows, :SIZE] = means[rows]
     state.x0[rows, SIZE:QUAT] = np.sort(state.x0[rows, SIZE:QUAT], 1)  # in rising order, as along the new axes
     state.m[rows, :LOGIT] = 0  # because the momentum was along the old axes
@@ -103,8 +110,10 @@ def split_at_edges(state: FitState, edges: Edges, count: int) -> FitState:
     """
     # `candidates` are the rows of x that may be split: at first all Gaussians across an edge, later the halves of the
     # last round. `sources` are the rows of the state from which the rows of x come
-    x, candidates = state.x, np.flatnonzero(_compute_cuts(state.splats, edges)[2])
-    sources, is_split = np.arange(len(x)), np.zeros(len(x), bool)
+    x = state.x
+    candidates = np.flatnonzero(_compute_cuts(state.splats, edges)[2])
+    sources = np.arange(len(x))
+    is_split = np.zeros(len(x), bool)
     while len(x) < count:
         covars = covariances(
             x[candidates, QUAT:LOGIT].astype(np.float64), exp(x[candidates, SIZE:QUAT].astype(np.float64))
@@ -121,7 +130,8 @@ def split_at_edges(state: FitState, edges: Edges, count: int) -> FitState:
         inner, outer = _split_across(x[candidates[soft]], covars[soft], normals[soft])
         stays = distances[soft] > 0  # all other outer halves are dropped, of which at most a sixth lies inside
         x = np.concatenate([x, outer[stays]])
-        x[candidates[soft]], is_split[candidates[soft]] = inner, True
+        x[candidates[soft]] = inner
+        is_split[candidates[soft]] = True
         sources = np.concatenate([sources, sources[candidates[soft[stays]]]])
         candidates = np.concatenate([candidates[soft], np.arange(len(is_split), len(x))])
         is_split = np.concatenate([is_split, np.ones(len(x) - len(is_split), bool)])
@@ -159,8 +169,11 @@ def _find_nearest_edges(
     a share of the view's width. The kernel that cuts Gaussians chooses the edge by the same rule (``nearest_plane`` in
     edges.c), but does not return it.
     """
-    rows, deepest, cameras = np.arange(len(means)), np.full(len(means), -np.inf), edges.cameras
-    nearest, widths = np.zeros((len(means), 3)), np.zeros(len(means))
+    rows = np.arange(len(means))
+    deepest = np.full(len(means), -np.inf)
+    cameras = edges.cameras
+    nearest = np.zeros((len(means), 3))
+    widths = np.zeros(len(means))
     for view, (normals, offsets) in enumerate(zip(edges.normals, edges.offsets, strict=True)):
         sigmas = np.sqrt((matmul(normals, covars) * normals).sum(2))  # [n,4]
         distances = (offsets - matmul(means, normals.T)) / sigmas

@@ -110,7 +110,8 @@ class TailMean:
     def add(self, x: np.ndarray) -> None:
         """Add the parameters ``x [n,14]`` after a step; begin anew if the number of Gaussians has changed."""
         if self.total is None or len(self.total) != len(x):
-            self.total, self.count = 0 * x, 0
+            self.total = 0 * x
+            self.count = 0
         self.count += 1
         self.total += x
 
@@ -170,7 +171,8 @@ def renew_state(fit: FullFit) -> None:
     A change gives rows to other Gaussians, or turns the axes of a Gaussian, so the mean over the last steps begins
     anew. If some Gaussians are fixed, none are dropped or added, because the caller expects every Gaussian in its row.
     """
-    job, options = fit.run.job, fit.run.job.options
+    job = fit.run.job
+    options = fit.run.job.options
     if not options.grows or not fit.reaches(GROWTH, *CLEARS, *CUTS):
         return
     if fit.reaches(GROWTH) and job.fixed is None:
@@ -184,7 +186,8 @@ def renew_state(fit: FullFit) -> None:
 
 def take_step(fit: FullFit) -> None:
     """Take a step on a photo, and also a step on a view from outside if one is due; count the step in ``fit``."""
-    run, progress = fit.run, fit.progress
+    run = fit.run
+    progress = fit.progress
     step = fit.schedule.draw(fit.step + 1, progress, len(fit.state.x))
     if fit.reaches(run.half_part):  # later steps draw whole photos, whose errors differ from errors of samples
         fit.error = RecentMean()
@@ -195,7 +198,8 @@ def take_step(fit: FullFit) -> None:
         fit.optimiser.move(fit.state, veil_gradients(fit.state.splats, run.job.outside, outside_view), step)
     if run.job.region is not None:
         fit.state.keep_inside(run.job.region)
-    fit.step, fit.last = step.number, progress
+    fit.step = step.number
+    fit.last = progress
     if fit.step > fit.steps * (1 - run.job.options.tuning.average_share):
         fit.tail.add(fit.state.x)
 

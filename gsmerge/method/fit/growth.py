@@ -44,9 +44,11 @@ def grow_to(
     count = count if most_growth is None else min(count, most_growth * len(state.x))
     if len(state.x) >= count:
         return state
-    masses, before = error_masses(state, half), 0
+    masses = error_masses(state, half)
+    before = 0
     while before < len(state.x) < count:
-        before, (state, masses) = len(state.x), grow(state, masses, count)
+        before = len(state.x)
+        state, masses = grow(state, masses, count)
     return state
 
 
@@ -63,7 +65,8 @@ def grow(state: FitState, masses: np.ndarray, count: int) -> tuple[FitState, np.
         return state, masses
     worst = np.sort(np.argsort(-masses, kind="stable")[:num])
     first_halves = state.x[worst]
-    rows, longest = np.arange(num), first_halves[:, SIZE:QUAT].argmax(1)
+    rows = np.arange(num)
+    longest = first_halves[:, SIZE:QUAT].argmax(1)
     distances = OFFSET * exp(first_halves[rows, SIZE + longest])
     shift = quat_to_rotmat(first_halves[:, QUAT:LOGIT])[rows, :, longest] * distances[:, None]
     first_halves[rows, SIZE + longest] += 0.5 * log(1 - OFFSET**2)  # so both halves together are as long as the parent

@@ -29,7 +29,8 @@ from gsmerge.types import Cameras, Gaussians, Scene
 # Least and largest step back as a share of a view's median depth, rotation to the sides about the middle of the view in
 # degrees, and rotation up or down in degrees. Without a step back, cameras would see what new views between the photos
 # see, in which a fit has to fill gaps
-STEP_BACK_LOW, STEP_BACK_HIGH = (0.4, -35.0, -25.0), (1.6, 35.0, 25.0)
+STEP_BACK_LOW = (0.4, -35.0, -25.0)
+STEP_BACK_HIGH = (1.6, 35.0, 25.0)
 # The multiples of EVEN, modulo one, fill a cube evenly, whatever the number of multiples (the R sequence of Roberts
 # 2018)
 EVEN = np.array([0.8191725134, 0.6710436067, 0.5497004779])
@@ -41,9 +42,11 @@ GAUSSIANS_PER_PHOTO = 4000
 OUTSIDE_NEAR_PLANE = 0.25  # depth of the near plane, as a share of the median depth of a view
 # Depths are clipped to at most FAR_FACTOR times their quantile FAR_QUANTILE, because a single Gaussian far behind the
 # scene would change the mean depth of its pixels
-FAR_QUANTILE, FAR_FACTOR = 0.98, 4.0
+FAR_QUANTILE = 0.98
+FAR_FACTOR = 4.0
 # A pixel of the input is empty below EMPTY_OPACITY, and shows a surface above SOLID_OPACITY
-EMPTY_OPACITY, SOLID_OPACITY = 0.15, 0.9
+EMPTY_OPACITY = 0.15
+SOLID_OPACITY = 0.9
 # Width of the rim around the outlines of the input, as a share of the picture's width. Empty pixels in the rim do not
 # count, because Gaussians beside an outline fill the background that becomes visible in new views
 RIM_SHARE = 0.04
@@ -54,7 +57,9 @@ VEILED_LOSS = 0.15
 # fewer Gaussians, each one is larger and reaches from the borders of photos into empty space. With a fog weight of 1,
 # the large Gaussians would vanish, although photos show them. So fewer Gaussians mean a smaller weight of fog, but at
 # least LEAST_FOG_WEIGHT. VEIL_WEIGHT is the weight of veils relative to fog
-MANY_PER_PHOTO, LEAST_FOG_WEIGHT, VEIL_WEIGHT = 1000, 0.15, 30
+MANY_PER_PHOTO = 1000
+LEAST_FOG_WEIGHT = 0.15
+VEIL_WEIGHT = 30
 OUTSIDE_LEVEL = 3  # width of a pixel of the pictures, in pixels of a photo: 2 leaves as much fog, 4 a fifth more
 LEAST_WIDTH = 64  # least width of the pictures, pixels
 SCORED = 12  # the fog of a result is measured in at most about this many views
@@ -103,7 +108,8 @@ def place_outside_views(scene: Scene, start: Gaussians, photos: Photos, options:
     depths = [depths_inside(points, cameras[[view]]) for view in range(min(len(placed), len(cameras)))]
     ranges = [quantiles(view_depths, (0.5, FAR_QUANTILE)) for view_depths in depths]
     median, farthest = np.resize(ranges, (len(placed), 2)).T
-    near, far = OUTSIDE_NEAR_PLANE * median, FAR_FACTOR * farthest
+    near = OUTSIDE_NEAR_PLANE * median
+    far = FAR_FACTOR * farthest
     views, splats = blank_photos(placed, min(OUTSIDE_LEVEL, photos.width / LEAST_WIDTH)), make_splats(sample)
 
     def find_limits(view: int) -> np.ndarray:
@@ -140,7 +146,8 @@ def outside_cameras(
     rotations, like ``STEP_BACK_LOW`` and ``STEP_BACK_HIGH``.
     """
     depths = [middle_depth(means, cameras[[view]]) for view in range(min(count, len(cameras)))]
-    views, viewmats = [number % len(cameras) for number in range(count)], []
+    views = [number % len(cameras) for number in range(count)]
+    viewmats = []
     for number, view in enumerate(views):
         back, azimuth, elevation = low + (0.5 + number * EVEN) % 1 * np.subtract(high, low)
         viewmats.append(step_outside(cameras.viewmats[view], depths[view], back, azimuth, elevation))
@@ -168,7 +175,8 @@ def veil_gradients(splats: Splats, outside: Outside, view: int) -> Gradients:
     the loss is the opacity. Where the input shows a surface, pixels with a loss of ``VEILED_LOSS`` or less do not
     count. The loss of the view is the weighted mean over its pixels.
     """
-    views, limits = outside.views, outside.limits[view]
+    views = outside.views
+    limits = outside.limits[view]
     assert views.weights is not None
     tiles = _tiles_of(views.weights[view])
     tiled = tile_view(splats, **views.camera(view), near=outside.near[view], tiles=tiles)
@@ -190,7 +198,8 @@ def score_fog(splats: Splats, outside: Outside) -> float | None:
 
     At most about ``SCORED`` evenly spaced views from outside are drawn.
     """
-    fog, count = 0.0, 0
+    fog = 0.0
+    count = 0
     for view in range(0, len(outside.views), -(-len(outside.views) // SCORED)):
         empty = np.isinf(outside.limits[view])
         tiled = tile_view(splats, **outside.views.camera(view), near=outside.near[view], tiles=_tiles_of(empty))

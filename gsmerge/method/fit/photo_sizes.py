@@ -61,7 +61,8 @@ def photo_scale(scene: Scene, options: FitOptions, *, auto: bool) -> tuple[float
     Also returns a reason if the size is smaller than the option asks for, else None. With the option "auto", the size
     is above 1 only if ``auto`` is true.
     """
-    requested, largest = options.photo_scale, largest_scale(scene)
+    requested = options.photo_scale
+    largest = largest_scale(scene)
     can_enlarge = options.fit == "full" and options.half_res_part < 1
     if requested == "auto":
         enlarges = can_enlarge and auto and largest >= MIN_AUTO_SCALE
@@ -93,7 +94,8 @@ def large_photos(scene: Scene, scale: float) -> Photos:
     The pictures are uint8, because they may take as much memory as the scene. The photos are compared with renders that
     have the low-pass filter of a viewer at the photos' size. Raises ValueError if the scene has no larger photos.
     """
-    large, cameras = scene.large_photos, scene.cameras
+    large = scene.large_photos
+    cameras = scene.cameras
     if large is None:
         raise ValueError("expected a scene with photos larger than its views, got one without")
     focals = (0, 1), (0, 1)
@@ -160,7 +162,8 @@ def holdout_psnr(images: Sequence[np.ndarray], photos: Photos, weights: list[np.
 
     def view_gains(view: int) -> np.ndarray:
         """Return the factors of exposure ``[3]`` of one view."""
-        image, weight = clipped[view], weights[view][..., None]
+        image = clipped[view]
+        weight = weights[view][..., None]
         photo_products, image_squares = (
             (weight * picture * image).sum((0, 1), dtype=np.float64) for picture in (photos.images[view], image)
         )

@@ -119,7 +119,8 @@ class FitRun:
 
     def outside_view(self, step: int, progress: float) -> int | None:
         """Return the index of the view from outside to draw after step ``step`` (from 1), or None to draw none."""
-        outside, rates = self.job.outside, self.job.options.tuning
+        outside = self.job.outside
+        rates = self.job.options.tuning
         if outside is None or progress < rates.outside_from or step % rates.outside_every:
             return None
         return step // rates.outside_every % len(outside.views)
@@ -131,7 +132,8 @@ class FitRun:
         viewers one after the other. If there are larger photos, some of the later steps draw the larger photos, which
         has the effect of a viewer who moves closer.
         """
-        photos, has_larger = self.job.photos, len(self.job.photos) > 2
+        photos = self.job.photos
+        has_larger = len(self.job.photos) > 2
         is_early = progress < self.half_part
         if is_early and not self.samples:
             return DrawMode(1, photos[1].eps2d)
@@ -151,8 +153,11 @@ class FitRun:
 
 def prepare_fit(job: FitJob) -> FitRun:
     """Prepare a fit: choose held-out patches, the weights of pixels, the dropout, and how the first steps draw."""
-    photos, options = job.photos, job.options
-    num_photos, steps, dropout = len(photos[0]), options.steps, options.dropout
+    photos = job.photos
+    options = job.options
+    num_photos = len(photos[0])
+    steps = options.steps
+    dropout = options.dropout
     if dropout is None:
         dropout = LONG_DROPOUT if steps >= max(LONG_STEPS, LONG_ROUNDS * num_photos) else 0.0
         if num_photos <= FEW_VIEWS and steps >= MANY_STEPS:
@@ -231,13 +236,15 @@ class Schedule:
         if not self.views_left:
             self.views_left = self.rng.permutation(len(self.run.job.photos[0])).tolist()
         view = self.views_left.pop()
-        background, mask = self.rng.random(3, dtype=np.float32), None
+        background = self.rng.random(3, dtype=np.float32)
+        mask = None
         are_renders = self.run.job.num_scored is not None
         if are_renders and number % 2:  # most viewers have a black background
             background = np.zeros(3, np.float32)
         if self.run.dropout > 0:
             mask = self.rng.random(count, dtype=np.float32) >= self.run.dropout
-        mode, sample = self.run.draw_mode(number, progress), WHOLE_PHOTO
+        mode = self.run.draw_mode(number, progress)
+        sample = WHOLE_PHOTO
         if mode.stride > 1:
             sample = Sample(mode.stride, *OFFSETS[self.samples[view] % len(OFFSETS)])
             self.samples[view] += 1

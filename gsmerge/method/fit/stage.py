@@ -89,7 +89,8 @@ def fit_gaussians(gaussians: Gaussians, job: FitJob) -> FitResult:
     photos = job.scored_photos(0) if job.held_out is None else job.held_out
     survey = survey_photos(gaussians, run)
     is_shown = survey.visible(job.options.min_contribution)
-    start, rows = gaussians[is_shown], np.flatnonzero(is_shown)
+    start = gaussians[is_shown]
+    rows = np.flatnonzero(is_shown)
     fixed = None if job.fixed is None else job.fixed[rows]
     fitted, report = fit_full(start, run, survey[is_shown], fixed)
     assert report.origins is not None
@@ -98,7 +99,8 @@ def fit_gaussians(gaussians: Gaussians, job: FitJob) -> FitResult:
         moved_photos = photos if report.viewmats is None else replace(photos, viewmats=report.viewmats[: len(photos)])
         error_ratios = photo_mses(fitted, moved_photos) / photo_mses(start, photos)
         if not np.median(error_ratios) <= 1:  # not the mean, because a placed camera may see only one near Gaussian
-            fitted, stopped = start, "most photos were shown worse"
+            fitted = start
+            stopped = "most photos were shown worse"
             report = replace(report, method="none", accepted=False, stopped=stopped, viewmats=None, origins=rows)
     if job.outside is not None:
         report = replace(report, fog=score_fog(make_splats(fitted), job.outside))

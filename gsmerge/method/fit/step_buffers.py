@@ -78,7 +78,8 @@ class StepBuffers:
         for name, values in numbers.items():
             self.gaussians[name][:] = values
         table = self._fill_table(photo, weight, drawn)
-        table["failed"], table["step"] = 0, number
+        table["failed"] = 0
+        table["step"] = number
         self._run_phases(weight.shape, "cull", "project", "count")
         is_open = hides_most(table["num_intersections"], table["num_visible"])
         if is_open:  # many Gaussians are hidden, so the list of each tile ends where the tile is opaque
@@ -104,8 +105,12 @@ class StepBuffers:
         of_step = {"photo": photo, "weight": weight, "drawn": drawn}
         if weight.shape not in self.tables:
             height, width = weight.shape
-            columns, lines, line = -(-width // TILE), -(-height // TILE), kernels.room_of(width)
-            spans, tiles, corners = 2 * self.threads, columns * lines, (columns + 1) * (lines + 1)
+            columns = -(-width // TILE)
+            lines = -(-height // TILE)
+            line = kernels.room_of(width)
+            spans = 2 * self.threads
+            tiles = columns * lines
+            corners = (columns + 1) * (lines + 1)
             shapes: dict[str, tuple[int, ...]] = {
                 "image": (height, width, 3), "gradient": (height, width, 3), "transmittance": (height, width),
                 "errors": (height,), "terms": (self.threads, kernels.DERIVATIVE_ROWS, kernels.TERMS, line),

@@ -53,7 +53,8 @@ class PoseState:
             moments[view] += (1 - beta) * (sample - moments[view])
         next_m = betas[0] * self.m[view] + (1 - betas[0]) * slope  # Nesterov's look-ahead
         bias_m, bias_v = power(betas, self.counts[view] + np.array([1, 0]))
-        m_hat, v_hat = next_m / (1 - bias_m), self.v[view] / (1 - bias_v)
+        m_hat = next_m / (1 - bias_m)
+        v_hat = self.v[view] / (1 - bias_v)
         eps = 1e-15  # added to the denominator of Adam's step
         self.x[view] -= rates.poses_lr * self.pixel * (1 - progress) * m_hat / (np.sqrt(v_hat) + eps)
         self.x -= self.x.mean(0)
@@ -112,7 +113,9 @@ class Optimiser:
 
     def select_view(self, step: Step) -> tuple[np.ndarray, dict[str, Any]]:
         """Return the pixels ``[h,w,3]`` float32 of a photo with which a step compares, and the camera for them."""
-        photos, mode, sample = self.photos[step.mode.size], step.mode, step.sample
+        photos = self.photos[step.mode.size]
+        mode = step.mode
+        sample = step.sample
         camera = photos.camera(step.view, sample)
         camera |= {"eps2d": mode.eps2d / sample.stride**2, "antialiased": mode.antialiased or photos.antialiased}
         return np.ascontiguousarray(photos.image(step.view, step.background, sample), np.float32), camera
@@ -126,8 +129,10 @@ class Optimiser:
 
     def constants(self, state: FitState, step: Step) -> dict[str, np.ndarray]:
         """Return the constants of an Adam step by name, in the order of the arguments of ``kernels.adam``."""
-        options, count = self.run.job.options, max(len(state.x), 1)
-        rates, rounds = options.tuning, step.number / len(self.photos[0])
+        options = self.run.job.options
+        count = max(len(state.x), 1)
+        rates = options.tuning
+        rounds = step.number / len(self.photos[0])
         return {
             "rates": step_sizes(rates, step.progress, options.steps),
             "limits": self._limits[options.grows and step.progress >= GROWTH],

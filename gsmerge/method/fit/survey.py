@@ -58,10 +58,14 @@ def survey_photos(gaussians: Gaussians, run: FitRun) -> Survey:
         focal = max(sized.Ks[view][[0, 1], [0, 1]].max() for sized in photos)
         return tiled.ids, tiled.depths / focal, *survey(tiled, colors)
 
-    views, scored_views = choose_photos(gaussians, half), choose_scored_photos(len(half))
+    views = choose_photos(gaussians, half)
+    scored_views = choose_scored_photos(len(half))
     images = []  # renders of the scored views
-    inside, peaks = np.zeros(count, bool), np.zeros(count, np.float32)
-    sums, squares, pixels = np.zeros(count), np.zeros(count), np.full(count, np.inf, np.float32)
+    inside = np.zeros(count, bool)
+    peaks = np.zeros(count, np.float32)
+    sums = np.zeros(count)
+    squares = np.zeros(count)
+    pixels = np.full(count, np.inf, np.float32)
     for view, (ids, pixel_sizes, image, weights, view_peaks) in zip(views, in_turn(survey_view, views), strict=True):
         if view in scored_views:
             images.append(image)
@@ -112,7 +116,8 @@ def peak_weights(gaussians: Gaussians, photos: Photos) -> tuple[np.ndarray, np.n
         tiled = tile_view(splats, **photos.camera(view))
         return tiled.ids, list_contributions(tiled)[1]
 
-    peak, inside = np.zeros(len(gaussians), np.float32), np.zeros(len(gaussians), bool)
+    peak = np.zeros(len(gaussians), np.float32)
+    inside = np.zeros(len(gaussians), bool)
     for ids, peaks in in_turn(view_peaks, range(len(photos))):
         inside[ids] = True
         peak[ids] = np.maximum(peak[ids], peaks)
@@ -121,7 +126,8 @@ def peak_weights(gaussians: Gaussians, photos: Photos) -> tuple[np.ndarray, np.n
 
 def score_images(images: Sequence[np.ndarray], run: FitRun, half: Photos) -> float:
     """Return the PSNR (dB) of renders of the scored photos on held-out patches, or NaN without such patches."""
-    options, views = run.job.options, choose_scored_photos(len(half))
+    options = run.job.options
+    views = choose_scored_photos(len(half))
     if not options.scored:
         return float("nan")
     return holdout_psnr(images, half[views], [run.score_weights[view] for view in views], options.tuning.min_gain)

@@ -51,7 +51,8 @@ def find_owners(scene: Scene, groups: Groups) -> Owners:
 
     If a Gaussian contributes equally to superpixels of several views, the first view counts.
     """
-    count, lock = len(scene.gaussians), Lock()
+    count = len(scene.gaussians)
+    lock = Lock()
     best = Owners(np.zeros(count, np.float32), np.full(count, -1, np.int32), np.full(count, -1, np.int32))
 
     def update_best(view: int, tiled: TiledView) -> None:
@@ -59,7 +60,8 @@ def find_owners(scene: Scene, groups: Groups) -> Owners:
         view_labels = np.ascontiguousarray(groups.labels[view], np.int32)
         values, labels = dominant_labels(*tiled.lists, view_labels, groups.counts[view])
         with lock:
-            best_values, best_views = best.values[tiled.ids], best.views[tiled.ids]
+            best_values = best.values[tiled.ids]
+            best_views = best.views[tiled.ids]
             is_better = (values > best_values) | ((values == best_values) & (labels >= 0) & (view < best_views))
             ids = tiled.ids[is_better]
             best.values[ids], best.views[ids], best.labels[ids] = values[is_better], view, labels[is_better]
@@ -91,7 +93,8 @@ def middle_pixels(labels: np.ndarray, count: int) -> np.ndarray:
     y, x = np.divmod(np.arange(height * width), width)
     sizes = np.maximum(np.bincount(flat, minlength=count), 1)
     dy, dx = (axis - (np.bincount(flat, axis, count) / sizes)[flat] for axis in (y, x))
-    squares, min_squares = dx * dx + dy * dy, np.full(count, np.inf)
+    squares = dx * dx + dy * dy
+    min_squares = np.full(count, np.inf)
     np.minimum.at(min_squares, flat, squares)
     # The pixels are in descending order, so that of equally near pixels the first one overwrites the others
     nearest = np.flatnonzero(squares == min_squares[flat])[::-1]

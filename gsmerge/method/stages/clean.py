@@ -21,7 +21,8 @@ FLOATER_NEIGHBORS = 8  # an isolated Gaussian touches none of its FLOATER_NEIGHB
 # the share CURTAIN[0] of half the diagonal of the scene's box, or its largest scale exceeds the share CURTAIN[1] of
 # half the diagonal. The same scale, second largest or largest, also exceeds CURTAIN_FACTOR times its median over all
 # Gaussians
-CURTAIN, CURTAIN_FACTOR = (0.1, 0.33), 8.0
+CURTAIN = (0.1, 0.33)
+CURTAIN_FACTOR = 8.0
 FLOATER_GAUSSIANS = 200_000  # the share of floaters is estimated from at most about this many Gaussians
 
 ToWorld = Callable[[Gaussians], Gaussians]
@@ -49,7 +50,8 @@ def floaters(gaussians: Gaussians, rows: np.ndarray | None = None) -> np.ndarray
     hang across it. If ``rows [m]`` are given, only these Gaussians are tested, and the mask is ``[m]``.
     """
     rows = np.arange(len(gaussians)) if rows is None else rows
-    means, sizes = gaussians.means.astype(np.float64), _sorted_scales(gaussians)[1].astype(np.float64)
+    means = gaussians.means.astype(np.float64)
+    sizes = _sorted_scales(gaussians)[1].astype(np.float64)
     if len(means) <= FLOATER_NEIGHBORS:
         return np.zeros(len(rows), bool)
     nearest, touches = _nearest_distances(means, sizes, rows, 1)

@@ -58,8 +58,11 @@ def decode_merged(merged: MergedViews, scene: PicturedScene, options: DecodeOpti
     and other groups get the K Gaussians of this superpixel. Heads that make exactly K Gaussians of every group cannot
     make more for other groups.
     """
-    features, members, networks = merged.features, merged.members, merged.networks
-    count, exact = merged.segmentation.count, merged.segmentation.exact
+    features = merged.features
+    members = merged.members
+    networks = merged.networks
+    count = merged.segmentation.count
+    exact = merged.segmentation.exact
     if exact and not grows:
         with_faint = replace(options, min_opacity=0.0)
         gaussians = deal_visible(
@@ -86,7 +89,9 @@ def _decode_count(merged: MergedViews, scene: PicturedScene, count: int | None, 
     More Gaussians go to groups in which they lower distortion most. Faint Gaussians are left out, so the result may
     have fewer than ``count``.
     """
-    features, members, networks = merged.features, merged.members, merged.networks
+    features = merged.features
+    members = merged.members
+    networks = merged.networks
     children = None
     if count is not None:
         children = split_counts(features, members, max(0, count - len(features)), networks.max_children)
@@ -135,7 +140,8 @@ def mixed_counts(
 
 def group_saliency(features: FeatureGaussians, members: Members, saliency: np.ndarray) -> np.ndarray:
     """Return the mean saliency ``[g]`` of the pixels of each group's members, with 0 for members without a pixel."""
-    starts, pixels = features.starts, members.pixels[features.members]
+    starts = features.starts
+    pixels = members.pixels[features.members]
     values = np.where(pixels >= 0, saliency[pixels], 0.0)
     return np.add.reduceat(values, starts[:-1]) / np.diff(starts) if len(features) else np.zeros(0)
 
@@ -161,7 +167,8 @@ def divide_groups(features: FeatureGaussians, members: Members, counts: np.ndarr
 
     Returns the children, faint ones included, and the group ``[n]`` of each child, ascending.
     """
-    is_divided, gaussians = counts > 1, feature_to_gaussians(features)
+    is_divided = counts > 1
+    gaussians = feature_to_gaussians(features)
     if not is_divided.any():
         return gaussians, np.arange(len(features))
     centres, footprints = features.means.astype(np.float64), features.footprints.astype(np.float64)
@@ -241,7 +248,8 @@ def hull_gains(errors: np.ndarray) -> np.ndarray:
     num_groups, num_children = errors.shape
     gains = np.full((num_groups, num_children - 1), -np.inf)
     # `corner` is, for each group, the position in its errors of the last corner of its convex hull so far
-    corner, rows = np.zeros(num_groups, int), np.arange(num_groups)
+    corner = np.zeros(num_groups, int)
+    rows = np.arange(num_groups)
     for _ in range(num_children - 1):
         steps = np.arange(num_children)[None] - corner[:, None]
         with np.errstate(invalid="ignore", divide="ignore"):

@@ -20,7 +20,8 @@ from gsmerge.types import Cameras, FeatureGaussians, Groups, Scene
 
 # A group is contradicted if more views see through it than have a surface at its position. The optical depth of a
 # contradicted group is multiplied by ALONE if no other view has a surface at its position, and otherwise by DISPUTED
-ALONE, DISPUTED = 0.15, 0.39
+ALONE = 0.15
+DISPUTED = 0.39
 
 
 @stage("encode")
@@ -77,7 +78,8 @@ def member_rows(scene: Scene, members: Members, groups: Groups) -> tuple[np.ndar
     parallel_map(label, range(0, len(labels), FOOTPRINT_ROWS))
     starts, ids = group_members(labels, int(counts.sum()))
     sizes = np.diff(starts)
-    has_members, views = sizes > 0, np.repeat(np.arange(len(scene)), groups.counts)
+    has_members = sizes > 0
+    views = np.repeat(np.arange(len(scene)), groups.counts)
     return np.concatenate([[0], np.cumsum(sizes[has_members])]), ids, views[has_members]
 
 

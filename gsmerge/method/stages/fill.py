@@ -32,10 +32,12 @@ FILLED_SHARE = 0.03  # largest number of new Gaussians, as a share of the fitted
 FILL_LEVEL = 8  # width of a drawing's pixel, in pixels of the views; large, because new Gaussians are blurred
 FILL_MARGIN = 0.05  # margin that is added to each side of a drawing, as a share of its width or height
 # Gaps have a transmittance above the first number, and surfaces have a transmittance below the second one
-GAP_TRANSMITTANCE, SURFACE_TRANSMITTANCE = 0.1, 0.05
+GAP_TRANSMITTANCE = 0.1
+SURFACE_TRANSMITTANCE = 0.05
 # A surface is not continued if its depth is less than NEARER_SHARE times the largest depth in a window around the
 # pixel. The window reaches from the pixel to each side by the share WINDOW_SHARE of the picture's width
-WINDOW_SHARE, NEARER_SHARE = 0.08, 0.85
+WINDOW_SHARE = 0.08
+NEARER_SHARE = 0.85
 MOST_FILLED_VIEWS = 64  # most views of a scene that is filled, because the time grows with their square
 DEPTH_FACTORS = (1, 1.06, 1.15, 1.3, 1.6, 2.2)  # depths that are tried for a new Gaussian, in depths of the surface
 BESIDE_PIXELS = 2  # a new Gaussian reaches at most BESIDE_PIXELS beyond the pixel that it fills
@@ -54,7 +56,8 @@ def fill_between(
     ``beyond`` is true. Scenes of more than ``MOST_FILLED_VIEWS`` views get no new Gaussians, because their photos show
     nearly everything between the cameras.
     """
-    added, max_count = fitted[:0], min(most, int(FILLED_SHARE * len(fitted)))
+    added = fitted[:0]
+    max_count = min(most, int(FILLED_SHARE * len(fitted)))
     if max_count == 0 or not 1 < len(cameras) <= MOST_FILLED_VIEWS:
         return added
     width, height = (max(FILL_LEVEL, round(side / FILL_LEVEL)) for side in (cameras.width, cameras.height))
@@ -92,7 +95,8 @@ def _on_covered_pixels(gaussians: Gaussians, covering: Gaussians, camera: Camera
 
     Each of the Gaussians ``covering`` covers the four pixels nearest to its centre.
     """
-    covered, last = np.zeros((camera.height + 2, camera.width + 2), bool), (camera.width + 1, camera.height + 1)
+    covered = np.zeros((camera.height + 2, camera.width + 2), bool)
+    last = (camera.width + 1, camera.height + 1)
     (positions,), (depths,) = project(covering.means, camera)
     corners = positions[depths > 0, None] + np.array([(0.5, 0.5), (0.5, 1.5), (1.5, 0.5), (1.5, 1.5)])
     x, y = np.clip(np.floor(corners), 0, last).astype(np.int64).reshape(-1, 2).T
@@ -117,7 +121,8 @@ class Seen:
 
     def contradict(self, points: np.ndarray) -> np.ndarray:
         """Return a mask ``[n]`` of the ``points [n,3]`` that would hide a surface or appear in a gap in some camera."""
-        (pixels, z), size = project(points, self.cameras), np.array([self.cameras.width, self.cameras.height])
+        pixels, z = project(points, self.cameras)
+        size = np.array([self.cameras.width, self.cameras.height])
         inside = (z > 0) & ((pixels >= -BESIDE_PIXELS) & (pixels < size + BESIDE_PIXELS)).all(2)
         camera, point = np.nonzero(inside)
         column, row = np.clip(pixels[inside].astype(np.int64), 0, size - 1).T
@@ -165,7 +170,8 @@ def _continue_surfaces(
     Gaussians may be outside of the field of view of all photos.
     """
     drawn_depths, transmittance, image = drawing
-    solid, gaps = transmittance < SURFACE_TRANSMITTANCE, transmittance > GAP_TRANSMITTANCE
+    solid = transmittance < SURFACE_TRANSMITTANCE
+    gaps = transmittance > GAP_TRANSMITTANCE
     window = np.ones((2 * round(WINDOW_SHARE * camera.width) + 1,) * 2, np.uint8)
     nearer = NEARER_SHARE * cv2.dilate(np.where(solid, drawn_depths, np.float32(0)), window)
     far = solid & (drawn_depths >= nearer)
@@ -177,9 +183,13 @@ def _continue_surfaces(
     # training captures
     blur_pixels = 2.0
     sums = blur(fill_gaps(values, far) * (gaps | far)[..., None], blur_pixels)[gaps]
-    inverse_depths, colors, weights = sums[:, 0], sums[:, 1:4], sums[:, 4]
-    surface_depths, colors = weights / inverse_depths, colors / weights[:, None]
-    eye, rays = camera.centres[0], pixel_rays(gaps, camera.Ks[0], camera.viewmats[0])
+    inverse_depths = sums[:, 0]
+    colors = sums[:, 1:4]
+    weights = sums[:, 4]
+    surface_depths = weights / inverse_depths
+    colors = colors / weights[:, None]
+    eye = camera.centres[0]
+    rays = pixel_rays(gaps, camera.Ks[0], camera.viewmats[0])
     depths = np.array(DEPTH_FACTORS)[:, None] * surface_depths.astype(np.float64)
     points = (eye + depths[..., None] * rays).reshape(-1, 3)
     wrong = np.zeros(len(points), bool) if beyond else ~seen[0].show(points)

@@ -56,7 +56,8 @@ def fit_around(start: Decoded, prepared: Prepared, options: FitOptions, seed: in
     """
     share = len(start.gaussians) / len(prepared.scene.gaussians)
     options = replace(options, tuning=options.tuning.scaled(min(1.0, RENDERS_STEP / math.sqrt(share))))
-    scene, reference = prepared.scene_around if options.grows else prepared.scene, prepared.reference
+    scene = prepared.scene_around if options.grows else prepared.scene
+    reference = prepared.reference
     held_out = reference.score_views if reference.placed else ()
     views = [view for view in range(len(scene)) if view not in held_out]
     num_own = len(prepared.scene) - len(held_out)

@@ -25,7 +25,8 @@ def match(features: FeatureGaussians, options: MatchOptions) -> Matches:
     rows = np.flatnonzero(features.extinctions > 0)
     if options.match == "none" or len(rows) < 2 or len(distinct(features.views)) < 2:
         return Matches(np.arange(len(features)), len(features))
-    means, views = features.means[rows].astype(np.float64), features.views[rows]
+    means = features.means[rows].astype(np.float64)
+    views = features.views[rows]
     covars = np.ascontiguousarray(features.covars[rows].astype(np.float64).reshape(-1, 9)[:, UPPER_TRIANGLE])
     colors = SH_C0 * features.sh0[rows, 0].astype(np.float64)
     neighbors = nearest_of_other_views(means, views, options.num_neighbors)

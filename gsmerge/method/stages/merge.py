@@ -78,7 +78,8 @@ def pool_runs(features: FeatureGaussians, order: np.ndarray, cuts: np.ndarray) -
 
     sizes = np.diff(np.append(cuts, len(order)))
     run = np.repeat(np.arange(len(cuts)), sizes)
-    gains, extinctions = rows(features.gains), rows(features.extinctions)
+    gains = rows(features.gains)
+    extinctions = rows(features.extinctions)
     share = np.maximum(rows(features.weights) * gains, 1e-12)
     share /= total(share)[run]  # of each part in its cluster
     means = total(share[:, None] * rows(features.means))

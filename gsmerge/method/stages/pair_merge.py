@@ -73,7 +73,8 @@ def merge_neighbors(gaussians: Gaussians, count: int, power: float = POWERS[0]) 
 def cloud_of(g: Gaussians) -> Cloud:
     """Return the moments of Gaussians. Flat Gaussians get a little thickness, so that they have a volume."""
     count = len(g)
-    covars, masses = np.empty((count, 6), np.float32), np.empty(count, np.float32)
+    covars = np.empty((count, 6), np.float32)
+    masses = np.empty(count, np.float32)
     quats, scales = (np.ascontiguousarray(column, np.float32) for column in (g.quats, g.scales))
     gaussian_moments(quats, scales, g.opacities.astype(np.float32).clip(MIN_OPACITY, 1), FLATNESS, covars, masses)
     sh = np.concatenate([g.sh0, g.shN], 1, dtype=np.float32).reshape(count, -1)
@@ -109,7 +110,8 @@ def _merge_round(cloud: Cloud, count: int) -> Cloud:
     if num_pairs == 0:
         return cloud[np.sort(np.argsort(-cloud.masses, kind="stable")[:count])]
     highest = np.partition(costs, num_pairs - 1)[num_pairs - 1]
-    below, equal = np.flatnonzero(costs < highest), np.flatnonzero(costs == highest)
+    below = np.flatnonzero(costs < highest)
+    equal = np.flatnonzero(costs == highest)
     cheapest = np.concatenate([below, equal[: num_pairs - len(below)]])  # of equal costs, the first ones
     return merge_rows(cloud, pairs[np.sort(cheapest)])
 
@@ -138,7 +140,9 @@ def gaussians_of_cloud(cloud: Cloud, source: Gaussians, wider: float = 0.0) -> G
     scales *= np.sqrt(opacities).clip(1, max_growth)[:, None]
     opacities = np.minimum(opacities, MAX_OPACITY)
     sh = cloud.sh.reshape(len(cloud), -1, 3)
-    means, quats, scales = to_float32(cloud.means), to_float32(quats), to_float32(scales)
+    means = to_float32(cloud.means)
+    quats = to_float32(quats)
+    scales = to_float32(scales)
     out = Gaussians(means, quats, scales, to_float32(opacities), sh[:, :1].copy(), sh[:, 1:].copy())
     unmerged = np.flatnonzero(cloud.sizes == 1)
     for name, column in vars(out).items():

@@ -52,7 +52,10 @@ def _find_limit(gaussians: Gaussians, peaks: np.ndarray, photos: Photos) -> floa
     """
     start_limit = 0.02  # limit of the first trial
     # Limits up to `low` are not noticed, and limits from `high` on are noticed
-    splats, low, high, limit = make_splats(gaussians), 0.0, math.inf, start_limit
+    splats = make_splats(gaussians)
+    low = 0.0
+    high = math.inf
+    limit = start_limit
 
     def clip(_: int, image: np.ndarray, __: np.ndarray) -> np.ndarray:
         """Clip a render as a picture on a screen is."""
@@ -71,7 +74,9 @@ def _find_limit(gaussians: Gaussians, peaks: np.ndarray, photos: Photos) -> floa
         return math.sqrt(max(photo_errors(splats, photos, compare, keep=lambda _: shown)))
 
     trials = 6  # most limits that are tried
-    min_decrease, max_increase = 0.8, 2.0  # bounds of the factor on a limit that is too large, and on one that is not
+    # bounds of the factor on a limit that is too large, and on one that is not
+    min_decrease = 0.8
+    max_increase = 2.0
     for _ in range(trials):
         is_noticed = (change := measure_change(limit)) > ROUNDING
         low, high = (low, limit) if is_noticed else (limit, high)

@@ -72,7 +72,8 @@ def segment_scene(
     An exact count is cut from the region tree, which gives a plain wall few superpixels and a fern many. Scenes whose
     pixels differ in importance are always cut from the tree. If the shared tree is too coarse, a finer tree is built.
     """
-    options, num_views = choices.options, len(scene)
+    options = choices.options
+    num_views = len(scene)
     if count is None and scene.protected is not None:
         count = limits.default
     if count is None:
@@ -92,7 +93,8 @@ def scene_tree(scene: PicturedScene, options: SegmentOptions, limits: CountLimit
     The squared colour error of a pixel is multiplied by its importance if that is above 1. For this, colours are
     multiplied by the square root of the importance.
     """
-    images, per_view = scene.images, max(limits.per_view, -(-count // len(scene)))
+    images = scene.images
+    per_view = max(limits.per_view, -(-count // len(scene)))
     if scene.importance is not None and scene.protected is not None:
         images = images * np.sqrt(np.maximum(scene.importance, 1))[..., None]
         per_view = int(per_view * scene.importance.max())  # important pixels need more superpixels
@@ -167,7 +169,8 @@ def region_tree(images: np.ndarray, depths: np.ndarray, groups: Groups, valid: n
         depth_range = 1e3  # largest factor by which a depth may be above or below the median
         clipped = np.clip(depths[view] / median, 1 / depth_range, depth_range)
         usable = np.ascontiguousarray(np.where(is_usable, clipped, 0), np.float32)
-        labels, count = pad_labels(groups.labels[view]), groups.counts[view]
+        labels = pad_labels(groups.labels[view])
+        count = groups.counts[view]
         pixels = np.ascontiguousarray(images[view], np.float32)
         rows = np.empty((2 * count, TREE_COLUMNS))
         error = region_sums(labels, pixels, usable, count, rows) + DEPTH_WEIGHT * float(rows[:count, PLANE_ERROR].sum())
@@ -179,7 +182,8 @@ def region_tree(images: np.ndarray, depths: np.ndarray, groups: Groups, valid: n
 
     merged_views = parallel_map(merge_view, range(len(images)))
     parents, view_heights, growths, errors, num_pixels = zip(*merged_views, strict=True)
-    offsets, heights = np.concatenate([[0], np.cumsum([len(h) for h in view_heights])]), np.concatenate(view_heights)
+    offsets = np.concatenate([[0], np.cumsum([len(h) for h in view_heights])])
+    heights = np.concatenate(view_heights)
     # A merge is at least as high as the merges that made its two regions, and comes after them. A stable sort keeps
     # this order
     order = np.argsort(heights, kind="stable")
@@ -220,11 +224,13 @@ def knee(counts: np.ndarray, distortions: np.ndarray) -> int:
     a slope of at least ``REGION_KNEE_SLOPE``, or the least N if there is none. ``counts [m]`` are all different, and
     ``distortions [m]`` are mean squared errors per pixel and channel.
     """
-    counts, distortions = np.asarray(counts), np.asarray(distortions, dtype=float)
+    counts = np.asarray(counts)
+    distortions = np.asarray(distortions, dtype=float)
     if len(counts) == 0 or counts.shape != distortions.shape:
         raise ValueError(f"expected as many distortions as counts, got {distortions.shape} for {counts.shape}")
     order = np.argsort(counts)
-    log_counts, error = log(counts[order].astype(float)), np.maximum.accumulate(distortions[order][::-1])[::-1]
+    log_counts = log(counts[order].astype(float))
+    error = np.maximum.accumulate(distortions[order][::-1])[::-1]
     quality = -10 * log10(KNEE_FLOOR + np.maximum(error, 0))
     knee_step = 1.25  # the slope of the curve is measured over this factor of the count
     before = np.interp(log_counts - log(knee_step), log_counts, quality)

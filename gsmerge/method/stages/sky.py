@@ -23,21 +23,26 @@ from gsmerge.types import Cameras, Gaussians
 
 GRADIENT_PIXELS = 480.0  # gradients are measured in a photo with GRADIENT_PIXELS on its longer side
 # Blue sky is brighter than DARK_SKY. White sky is brighter than WHITE_SKY, and has less chroma than GREY_SKY
-DARK_SKY, WHITE_SKY, GREY_SKY = 0.35, 0.75, 0.12
+DARK_SKY = 0.35
+WHITE_SKY = 0.75
+GREY_SKY = 0.12
 FAR_RATIO = 3.0  # the sky is more than FAR_RATIO times as far away as the rest
 # Least number of views that show sky, and their least share of all views. If fewer views show sky, it may be something
 # else that looks like sky
-LEAST_SKY_VIEWS, LEAST_SKY_SHARE = 2, 0.2
+LEAST_SKY_VIEWS = 2
+LEAST_SKY_SHARE = 0.2
 SKY_GAUSSIANS = 200_000  # the depths of at most this many Gaussians are compared
 
 
 def sky(gaussians: Gaussians, cameras: Cameras, photos: np.ndarray) -> np.ndarray:
     """Return a mask ``[n]`` of the canonical Gaussians that contribute mostly to the sky of ``photos [v,h,w,3]``."""
-    regions, mask = sky_regions(gaussians.means, cameras, photos), np.zeros(len(gaussians), bool)
+    regions = sky_regions(gaussians.means, cameras, photos)
+    mask = np.zeros(len(gaussians), bool)
     if not regions:
         return mask
     # There are at most max_rounds. A round that adds less than last_share of the sky so far is the last one
-    max_rounds, last_share = 6, 0.02
+    max_rounds = 6
+    last_share = 0.02
     for _ in range(max_rounds):  # each round finds Gaussians that were hidden behind the sky found before
         rows = np.flatnonzero(~mask)
         is_sky = _mostly_inside(gaussians[rows], cameras, regions)
@@ -61,11 +66,13 @@ def sky_regions(means: np.ndarray, cameras: Cameras, photos: np.ndarray) -> dict
 def _mostly_inside(gaussians: Gaussians, cameras: Cameras, regions: Mapping[int, np.ndarray]) -> np.ndarray:
     """Return a mask ``[n]`` of the Gaussians with most of their blending weight inside the regions of the views."""
     splats = make_splats(gaussians)
-    inside, total = np.zeros(len(splats)), np.zeros(len(splats))
+    inside = np.zeros(len(splats))
+    total = np.zeros(len(splats))
     for view, region in regions.items():
         tiled = tile_camera(splats, cameras, view)
         image = np.zeros((*region.shape, LANES), np.float32)
-        image[..., 0], image[..., 1] = region, 1
+        image[..., 0] = region
+        image[..., 1] = 1
         sums = np.zeros((len(tiled.ids), LANES))  # of each Gaussian's weights times the channels of the image
         collect(*list_weights(*tiled.lists, tiled.height, tiled.width), *tiled.lists[1:], image, sums)
         inside[tiled.ids] += sums[:, 0]
@@ -79,7 +86,8 @@ def _is_farther_than_rest(means: np.ndarray, camera: Cameras, region: np.ndarray
     (pixels,), (depths,) = project(means[:: max(1, -(-len(means) // SKY_GAUSSIANS))], camera)
     inside = (depths > 0) & is_inside(pixels, camera)
     x, y = pixels[inside].astype(int).T
-    in_region, depths = region[y, x], depths[inside]
+    in_region = region[y, x]
+    depths = depths[inside]
     if not in_region.any() or in_region.all():
         return False
     return bool(np.median(depths[in_region]) > FAR_RATIO * np.median(depths[~in_region]))
@@ -91,7 +99,9 @@ def sky_region(photo: np.ndarray) -> np.ndarray:
     scale = max(height, width) / GRADIENT_PIXELS
     sigma = max(1.5 * scale, 0.5)
     upper = photo[: round(4 * sigma) + 3]  # the blurred upper border depends on these rows alone
-    least_area, least_top = 0.02, 0.4  # the sky has at least these shares of the picture and of its upper border
+    # the sky has at least these shares of the picture and of its upper border
+    least_area = 0.02
+    least_top = 0.4
     if _like_sky(blur(upper, sigma), scale)[0].mean() < least_top:
         return np.zeros((height, width), bool)
     soft = blur(photo, sigma)
@@ -109,7 +119,9 @@ def _like_sky(soft: np.ndarray, scale: float) -> np.ndarray:
     """
     right, down = (reduce(np.maximum, np.moveaxis(np.abs(slope), 2, 0)) / 8 for slope in sobel(soft))
     red, green, blue = colors = np.moveaxis(soft, 2, 0)
-    bright, dark = reduce(np.maximum, colors), reduce(np.minimum, colors)  # takes a tenth of the time of max(2)
+    # takes a tenth of the time of max(2)
+    bright = reduce(np.maximum, colors)
+    dark = reduce(np.minimum, colors)
     is_blue = (blue >= red) & (blue >= green - 0.02) & (bright > DARK_SKY)
     is_white = (bright > WHITE_SKY) & (bright - dark < GREY_SKY)
     max_gradient = 0.02  # largest gradient of a colour per pixel of a photo of GRADIENT_PIXELS
@@ -118,13 +130,15 @@ def _like_sky(soft: np.ndarray, scale: float) -> np.ndarray:
 
 def _pales_downwards(photo: np.ndarray, region: np.ndarray) -> bool:
     """Return true if the colours of a region lose saturation towards the lower border of the picture."""
-    colors, rows = photo[region], np.nonzero(region)[0]
+    colors = photo[region]
+    rows = np.nonzero(region)[0]
     bright = colors.max(1)
     saturation = (bright - colors.min(1)) / np.maximum(bright, 1e-6)
     low, high = np.percentile(saturation, (10, 90))
     # Least difference between percentiles 10 and 90 of the saturation, and largest correlation between saturation and
     # row. Rows are counted downwards
-    min_spread, max_correlation = 0.08, -0.12
+    min_spread = 0.08
+    max_correlation = -0.12
     if high - low < min_spread or np.ptp(rows) == 0:
         return False
     return bool(correlation(rows, saturation) <= max_correlation)

@@ -33,7 +33,9 @@ from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.stages import SegmentOptions
 from gsmerge.types import Groups
 
-RECTANGLES, EARLY_SWEEPS = 2.0, 0  # defaults of rdseg: rectangles per superpixel, and sweeps before they are merged
+# defaults of rdseg: rectangles per superpixel, and sweeps before they are merged
+RECTANGLES = 2.0
+EARLY_SWEEPS = 0
 
 
 def segment(images: np.ndarray, options: SegmentOptions, count: int | None = None) -> Groups:
@@ -133,7 +135,9 @@ def _slic(pixels: np.ndarray, count: int) -> tuple[np.ndarray, int]:
         from skimage.segmentation import slic
     except ImportError as error:
         raise ValueError("segmentation slic: scikit-image is not installed; run pip install scikit-image") from error
-    lab, (height, width, _), asked = _to_lab(pixels), pixels.shape, count
+    lab = _to_lab(pixels)
+    height, width, _ = pixels.shape
+    asked = count
     compactness = 10 / max(float(np.ptp(lab)), 1e-3)  # its default; SLIC scales colours to [0, 1]
     while asked < height * width:
         pieces = slic(lab, asked, compactness, start_label=0, channel_axis=-1, convert2lab=False)
@@ -193,7 +197,8 @@ def _as_pixels(array: np.ndarray) -> np.ndarray:
         return np.divide(array, np.float32(255), dtype=np.float32, order="C")
     if not np.issubdtype(array.dtype, np.floating):
         raise ValueError(f"image: expected uint8 or float, got {array.dtype}")
-    low, high = array.min(), array.max()
+    low = array.min()
+    high = array.max()
     range_slack = 1e-3  # colours may leave [0, 1] by this much, because resampling makes such values
     if not (low >= -range_slack and high <= 1 + range_slack):  # also refuses NaN
         raise ValueError(f"image: expected values in [0, 1], got {low:g} to {high:g}")
