@@ -79,7 +79,8 @@ class Assigner:
 
     def __init__(self, show: Callable[[int], ViewPictures], candidates: Candidates) -> None:
         small = show(SCORE_PIXELS[-1])
-        self.candidates, self._show = candidates, show
+        self.candidates = candidates
+        self._show = show
         self._comparer, self._correlations = Comparer(small), dict[int, np.ndarray]()
         self._offsets = dict[tuple[int, Assignment], PhotoOffsets | None]()
         self.has_contrast = self._comparer.measure_contrast() > MIN_CONTRAST  # [v], False for views of one plain colour
@@ -93,7 +94,9 @@ class Assigner:
         """Return the scores of photos in all views, relative to the noise among these photos."""
         ids = tuple(dict.fromkeys(photos))
         new = [photo for photo in ids if photo not in self._correlations]
-        min_per_task, max_tasks = 8, 16  # more tasks would take longer, because each reads the pictures of all views
+        # more tasks would take longer, because each reads the pictures of all views
+        min_per_task = 8
+        max_tasks = 16
         task_size = max(min_per_task, -(-len(new) // max_tasks))
 
         def correlate_task(start: int) -> np.ndarray:
@@ -159,12 +162,14 @@ class Assigner:
         If names are ``exact``, a photo is confirmed if its score is high and no other assignment scores higher. If the
         score does not confirm a photo, the photo is confirmed if the parts of its view's picture lie in place in it.
         """
-        out, confirmed = list[Assignment | None]([None] * len(named)), [False] * len(named)
+        out = list[Assignment | None]([None] * len(named))
+        confirmed = [False] * len(named)
         named_pairs = [(view, photo) for view, photo in enumerate(named) if photo is not None]
         if not named_pairs:
             return out, confirmed
         scores = self.score_in_views(photo for _, photo in named_pairs)
-        columns, proposed = [scores.photos.index(photo) for _, photo in named_pairs], dict[int, Assignment]()
+        columns = [scores.photos.index(photo) for _, photo in named_pairs]
+        proposed = dict[int, Assignment]()
         for (view, photo), column in zip(named_pairs, columns, strict=True):  # as stored, unless its tag fits better
             tag = self.candidates.tag(photo)
             stored, tagged = np.nan_to_num(scores.values[view, column, [0, tag]], nan=-np.inf)
@@ -176,7 +181,8 @@ class Assigner:
         # wrong pairs score about 0, and right pairs about the median, so a threshold half way separates them
         least = min(SIGNIFICANT, median(with_contrast) / 2) if _exceed_noise(with_contrast) else SIGNIFICANT
         for row, (view, assignment) in enumerate(proposed.items()):
-            score, highest = own[row], max(best[row, row], best[row, matched[row]])
+            score = own[row]
+            highest = max(best[row, row], best[row, matched[row]])
             correlation = scores.correlations[view, columns[row], assignment.orientation]
             # Few wrong pairs measure the noise badly, but a wrong photo hardly is the first in both of these ranks
             rivals = np.concatenate([scores.values[view].reshape(-1), scores.values[:, columns[row]].reshape(-1)])
@@ -187,7 +193,8 @@ class Assigner:
             # a photo that is portrait or landscape as the views are
             has_shape = bool(np.isfinite(scores.values[:, columns[row], assignment.orientation]).any())
             if is_clear and exact:
-                out[view], confirmed[view] = assignment, True
+                out[view] = assignment
+                confirmed[view] = True
             elif matches or (not self.has_contrast[view] and has_shape):
                 similarity = self.compare_parts(view, assignment)
                 out[view] = None if self.is_displaced(view, proposed) else assignment
@@ -245,10 +252,13 @@ class Assigner:
             return {}
         rows = sorted({view for view, _, _ in possible})
         columns = sorted({assignment.photo for _, assignment, _ in possible})
-        table, assignments = np.zeros((len(rows), len(columns))), dict[tuple[int, int], Assignment]()
+        table = np.zeros((len(rows), len(columns)))
+        assignments = dict[tuple[int, int], Assignment]()
         for view, assignment, similarity in possible:
-            row, column = rows.index(view), columns.index(assignment.photo)
-            table[row, column], assignments[row, column] = similarity, assignment
+            row = rows.index(view)
+            column = columns.index(assignment.photo)
+            table[row, column] = similarity
+            assignments[row, column] = assignment
         pairs_of_table = enumerate(_match_columns(table).tolist())  # column -1 for a row that gets none
         return {rows[row]: assignments[row, column] for row, column in pairs_of_table if (row, column) in assignments}
 
@@ -271,7 +281,8 @@ class Assigner:
             neighbours &= set(range(len(photos)))
             if neighbours <= compared:
                 break
-            compared, step = compared | neighbours, 1
+            compared = compared | neighbours
+            step = 1
 
         # The orientation in which a photo shows a view: the stored orientation, 0, is tried first, and that of its tag
         # next. Each is chosen if no other scores clearly higher, or else the orientation with the highest score
@@ -279,7 +290,8 @@ class Assigner:
         for view in views:
             for column in columns[view]:
                 if np.isfinite(best[view, column]):
-                    photo, values = scores.photos[column], np.nan_to_num(scores.values[view, column], nan=-np.inf)
+                    photo = scores.photos[column]
+                    values = np.nan_to_num(scores.values[view, column], nan=-np.inf)
                     tried = (0, self.candidates.tag(photo))
                     proposed = (turn for turn in tried if values[turn] > values.max() - SIGNIFICANT)
                     likely[view].append(Assignment(photo, next(proposed, int(values.argmax()))))
@@ -340,7 +352,8 @@ def _match_columns(scores: np.ndarray) -> np.ndarray:
 
     No column is chosen twice. The result is -1 for a row that gets no column.
     """
-    best, out = scores.argmax(1), np.full(len(scores), -1)
+    best = scores.argmax(1)
+    out = np.full(len(scores), -1)
     if len(set(best.tolist())) == len(best):  # the best columns differ, so no search is needed
         return np.asarray(best)
     from scipy.optimize import linear_sum_assignment  # here because it takes long to load

@@ -86,7 +86,9 @@ def fit_tones(colors: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> n
             np.round(_weigh_quantiles(values[used, channel], weights[used]), 6) for values in (colors, targets)
         )
         is_distinct = np.concatenate([[True], np.diff(before) > 1 / 255]) & (before > 0) & (before < 1)
-        x, y = before[is_distinct], np.maximum.accumulate(after[is_distinct].clip(0, 1))  # points of the curve
+        # points of the curve
+        x = before[is_distinct]
+        y = np.maximum.accumulate(after[is_distinct].clip(0, 1))
         # at x = 1: the last point, extended in proportion
         last_y = min(1.0, max(y[-1], y[-1] / x[-1])) if len(x) else 1.0
         curve = np.interp(np.arange(256) / 255, [0, *x, 1], [0, *y, last_y])
@@ -98,7 +100,8 @@ def map_tones(tones: np.ndarray, photo: np.ndarray) -> np.ndarray:
     """Map the colours of a photo ``[...,3]`` in [0, 1] by a tone curve ``[3,256]``, one row per channel."""
     levels = photo.astype(np.float32) * np.float32(255)
     lower = np.clip(levels.astype(np.int64), 0, 254)
-    fraction, channel = levels - lower, np.arange(3)
+    fraction = levels - lower
+    channel = np.arange(3)
     return np.asarray(tones[channel, lower] * (1 - fraction) + tones[channel, lower + 1] * fraction)
 
 
@@ -178,11 +181,13 @@ def _cross_fit(photos: np.ndarray, pictures: np.ndarray, weights: np.ndarray, ch
 
     The ``change`` maps photos to ``pictures [v,h,w,3]``, with ``weights [v,h,w]``.
     """
-    out, block_side = np.empty_like(photos), max(1.0, max(photos.shape[1:3]) / BLOCKS)
+    out = np.empty_like(photos)
+    block_side = max(1.0, max(photos.shape[1:3]) / BLOCKS)
     y, x = ((np.arange(size) / block_side).astype(int) for size in photos.shape[1:3])
     black_squares = (y[:, None] + x) % 2 == 1  # like those of a chess board
     for fold in (black_squares, ~black_squares):
-        colors, targets = photos[:, ~fold].reshape(-1, 3), pictures[:, ~fold].reshape(-1, 3)
+        colors = photos[:, ~fold].reshape(-1, 3)
+        targets = pictures[:, ~fold].reshape(-1, 3)
         out[:, fold] = change(photos[:, fold], colors, targets, weights[:, ~fold].reshape(-1))
     return out
 

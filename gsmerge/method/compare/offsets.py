@@ -18,7 +18,9 @@ from gsmerge.method.geometry.transforms import NORMAL_SPREAD
 from gsmerge.method.raster.photos import shrink_pictures
 
 OFFSET_PIXELS = 256  # pixels of the longer side of both pictures
-PART_PIXELS, MOST_OFFSET = 32, 12  # pixels: side of a part, and largest offset that is searched
+# pixels: side of a part, and largest offset that is searched
+PART_PIXELS = 32
+MOST_OFFSET = 12
 CONTRAST_PIXELS = 30  # pixels: side of the square whose mean is subtracted to get contrast
 TAPS = 64  # size of the Fourier transforms, at least PART_PIXELS + 2 MOST_OFFSET
 ZERO_OFFSET = 1  # pixels: smaller and equal offsets count as zero, since the peak of a correlation has this width
@@ -56,7 +58,8 @@ class PhotoOffsets:
         The number of parts in place is compared with the number of parts that moved together. The larger number decides
         if it exceeds the other by more than the square root of their sum, the standard error of a fair coin's tosses.
         """
-        in_place, together = self.num_in_place, self.num_moved_together
+        in_place = self.num_in_place
+        together = self.num_moved_together
         return in_place > together if abs(in_place - together) > np.sqrt(in_place + together) else None
 
 
@@ -111,7 +114,8 @@ def _correlate_offsets(photo: np.ndarray, picture: np.ndarray, weight: np.ndarra
 
     shifts = slice(0, 2 * MOST_OFFSET + 1)
     searched = PART_PIXELS + 2 * MOST_OFFSET  # side of the square of the photo in which a part is searched
-    weighted, photo_squares = picture * weight[..., None], (photo * photo).sum(-1)
+    weighted = picture * weight[..., None]
+    photo_squares = (photo * photo).sum(-1)
     spectrum = transform_parts(photo, searched) * transform_parts(weighted, PART_PIXELS).conj()
     products = np.fft.irfft2(spectrum.sum(1))[:, shifts, shifts]
     photo_spectrum = transform_parts(photo_squares, searched) * transform_parts(weight, PART_PIXELS).conj()

@@ -92,7 +92,8 @@ class Comparer:
         out = np.full((len(photos), self.views, ORIENTATIONS), np.nan)
         small = [shrink_pictures(photo[None], *fit_size(photo.shape[1::-1], SCORE_PIXELS[-1]))[0] for photo in photos]
         shapes = np.array([photo.shape for photo in photos]).reshape(-1, 3)
-        square, portrait = shapes[:, 0] == shapes[:, 1], shapes[:, 0] > shapes[:, 1]
+        square = shapes[:, 0] == shapes[:, 1]
+        portrait = shapes[:, 0] > shapes[:, 1]
         upright = self._square | square | (portrait == self._portrait)
         sideways = self._square | square | (portrait != self._portrait)
         for is_upright, fits in ((True, upright), (False, sideways)):
@@ -113,7 +114,9 @@ def _make_filters(small: ViewPictures, quarters: Sequence[int]) -> _Filters:
     Each view has two filters for each number of quarter turns, one of them for the mirrored photo.
     """
     orientations = tuple(quarter + mirrored for mirrored in (0, ORIENTATIONS // 2) for quarter in quarters)
-    products, weights, lengths = [], [], []
+    products = []
+    weights = []
+    lengths = []
     for picture, weight in zip(small.pictures, small.weights, strict=True):
         weighted = find_contrast(picture, weight) * weight[..., None]
         squares = weighted * weighted / np.maximum(weight, LEAST_OPACITY)[..., None]

@@ -12,9 +12,11 @@ CONFIRM_PIXELS = 1200  # sampled pixels of a view
 # A result is expected to be poor if the share of confirmed pixels is below POOR_SHARE. POOR_SHARE separates the poor
 # results of 15 captures from the sound results. If the share of pixels that no other view sees is above LONELY_SHARE, a
 # poor result is blamed on too few views
-POOR_SHARE, LONELY_SHARE = 0.5, 0.2
+POOR_SHARE = 0.5
+LONELY_SHARE = 0.2
 # Chance may change a share by CHANCE_ERRORS standard errors. Fewer samples than NORMAL_SAMPLES decide nothing
-CHANCE_ERRORS, NORMAL_SAMPLES = 2.0, 30
+CHANCE_ERRORS = 2.0
+NORMAL_SAMPLES = 30
 # The useful number of Gaussians per pixel is MOST_PER_PIXEL if at least SOUND_SHARE of the pixels are confirmed, and
 # FEWEST, the usual number, if at most WRONG_SHARE are confirmed. With more Gaussians than are useful, a fit memorises
 # the photos (docs/guide/compact.md). With MOST_PER_PIXEL instead of FEWEST, captures whose depth was confirmed lost at

@@ -14,8 +14,12 @@ from gsmerge.types import Gaussians, Scene
 # Limits that the Gaussians of every real capture keep. The median of the Gaussians' largest scales is at most
 # LARGE_SCALE times the diagonal of the box that holds most Gaussians. The median coefficient of the base colours is at
 # most BRIGHT_COLOR. The limits are not tested on fewer than FEWEST_TESTED Gaussians
-LARGE_SCALE, BRIGHT_COLOR, FEWEST_TESTED = 0.25, 10.0, 100
-FLAT_RANGE, FAINT_MEDIAN = 0.01, 1 / 255  # least range of the base colours' coefficients; least median opacity
+LARGE_SCALE = 0.25
+BRIGHT_COLOR = 10.0
+FEWEST_TESTED = 100
+# least range of the base colours' coefficients; least median opacity
+FLAT_RANGE = 0.01
+FAINT_MEDIAN = 1 / 255
 
 
 @dataclass(frozen=True)
@@ -68,9 +72,11 @@ def unlike_captures(gaussians: Gaussians) -> str | None:
     means = sample.means.astype(np.float64)
     low, high = quantiles(means, (0.01, 0.99))
     diagonal = float(np.sqrt(((high - low) ** 2).sum()))
-    size, color = median(reduce(np.maximum, sample.scales.T)), median(np.abs(sample.sh0))
+    size = median(reduce(np.maximum, sample.scales.T))
+    color = median(np.abs(sample.sh0))
     low_color, high_color = quantiles(sample.sh0[:, 0], (0.01, 0.99))
-    flat, faint = float((high_color - low_color).max()) < FLAT_RANGE, median(sample.opacities) < FAINT_MEDIAN
+    flat = float((high_color - low_color).max()) < FLAT_RANGE
+    faint = median(sample.opacities) < FAINT_MEDIAN
     if color > BRIGHT_COLOR:
         problem = f"half of the base colours have coefficients beyond {color:.3g}"
     elif flat:

@@ -123,14 +123,17 @@ class NetworkContext(Corrector):
         options = self.options
         if len(features) == 0 or not options.refiner:
             return features
-        group_features, views = self.describe(features), features.views
+        group_features = self.describe(features)
+        views = features.views
         neighbors = find_neighbors(as_array(features.means), options.neighbors)
-        count, width = len(features), neighbors.shape[1] + 1
+        count = len(features)
+        width = neighbors.shape[1] + 1
         table = np.concatenate([np.arange(count)[:, None], neighbors], 1)
 
         def run_table(rows: np.ndarray, _: int) -> Any:
             """Run the refiner on the groups ``rows``, each with its neighbours."""
-            ids, owners = table[rows].reshape(-1), np.repeat(rows, width)
+            ids = table[rows].reshape(-1)
+            owners = np.repeat(rows, width)
             mask = ids >= 0
             ids = np.where(mask, ids, owners)
             relative = self.make_tokens(group_features.base, ids, owners, group_features)
@@ -138,7 +141,9 @@ class NetworkContext(Corrector):
             tokens = concat_columns([relative, is_same_view, features.latents[ids]]).reshape(len(rows), width, -1)
             return self.networks.run("refiner", tokens, mask.reshape(len(rows), width), group_features.group[rows])
 
-        max_width, columns = 1 << (width - 1).bit_length(), FEATURE + options.latent  # width up to a power of two
+        # width up to a power of two
+        max_width = 1 << (width - 1).bit_length()
+        columns = FEATURE + options.latent
         outputs = self.run_tables(np.full(count, width), max_width, columns, run_table)
         return _apply_outputs(group_features, outputs, self)
 
@@ -194,7 +199,9 @@ def encode_features(features: FeatureGaussians, context: NetworkContext) -> Feat
     options = context.options
     if not options.encoder:
         return replace(features, latents=np.zeros((len(features), options.latent), np.float32))
-    group_features, starts, ids = context.describe(features), features.starts, features.members
+    group_features = context.describe(features)
+    starts = features.starts
+    ids = features.members
     sizes, seeds = np.diff(starts), point_seeds(as_array(features.means), context.seed)
     base = group_features.base
     # [g,3] the longest axis of each Gaussian: column 2 of its 3 x 3 rotation, because scales are ascending
@@ -258,7 +265,8 @@ def prepare_children(
     """
     if not options.makes_children:
         return children
-    base, frames = group_features.base, group_features.frames.astype(np.float64)
+    base = group_features.base
+    frames = group_features.frames.astype(np.float64)
     return replace(
         children,
         means=base.means[parents],
@@ -284,7 +292,9 @@ def run_heads(
     sizes = np.concatenate([first_sizes, (all_sizes - first_sizes)[is_split]])
     owners = np.concatenate([np.arange(count), np.flatnonzero(is_split)])  # parent of each run
     # The outputs begin with a row of zeros, for children without a head
-    outputs, output_rows, num_outputs = [np.zeros((1, RESIDUAL), np.float32)], np.zeros(len(children), np.int64), 1
+    outputs = [np.zeros((1, RESIDUAL), np.float32)]
+    output_rows = np.zeros(len(children), np.int64)
+    num_outputs = 1
     for slots, min_size in zip(SLOTS, (1, 2, 3), strict=True):  # the heads and their least numbers of children
         rows = np.flatnonzero((sizes >= min_size) & (sizes <= slots))
         if len(rows) == 0:
@@ -313,7 +323,8 @@ def _run_head(
     ``parents [r]`` are the groups of the runs, and ``ids [r,slots]`` the rows of the children. ``mask [r,slots]`` is
     false for slots without a child.
     """
-    slots, latents = mask.shape[1], group_features.features.latents
+    slots = mask.shape[1]
+    latents = group_features.features.latents
 
     def run_table(rows: np.ndarray, _: int) -> Any:
         """Run the head on the runs of children with the numbers ``rows``."""

@@ -20,8 +20,13 @@ from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import FeatureGaussians, Gaussians
 
 # Columns of a correction
-MEAN_COLUMNS, SIZE_COLUMNS, ROTATION_COLUMNS = slice(0, 3), slice(3, 6), slice(6, 9)
-LOGIT_COLUMN, COLOR_COLUMNS, MASS_COLUMN = 9, slice(10, 13), 13  # the last is only in corrections of Feature Gaussians
+MEAN_COLUMNS = slice(0, 3)
+SIZE_COLUMNS = slice(3, 6)
+ROTATION_COLUMNS = slice(6, 9)
+# the last is only in corrections of Feature Gaussians
+LOGIT_COLUMN = 9
+COLOR_COLUMNS = slice(10, 13)
+MASS_COLUMN = 13
 HALF = 0.5  # encoder, merger and refiner may each use the share HALF of the bounds
 CORRECTION_ROWS = 8192  # rows per task
 

@@ -20,7 +20,8 @@ FAR_LOG = 0.3  # differences of the logarithms of depths are clipped to at most 
 MIN_SURFACE_OPACITY = 1 / 255  # a fainter Gaussian is no surface
 STATS_ROWS = 8192  # points per task
 # The search compares MAX_COMPARED points for each wanted neighbour, or for MIN_NEIGHBORS neighbours if fewer are wanted
-MAX_COMPARED, MIN_NEIGHBORS = 64, 16
+MAX_COMPARED = 64
+MIN_NEIGHBORS = 16
 
 
 def cross_view_stats(
@@ -42,8 +43,10 @@ def cross_view_stats(
         return stats
     points, colors = np.ascontiguousarray(means, np.float64), np.ascontiguousarray(SH_C0 * sh0[:, 0])
     viewmats, Ks = (np.ascontiguousarray(array, np.float64) for array in (cameras.viewmats, cameras.Ks))
-    size, limits = (cameras.width, cameras.height), (SH_C0, NEAR_LOG, FAR_LOG, MIN_SURFACE_OPACITY)
-    sums, m = np.zeros((len(points), SUM_COLUMNS)), members
+    size = (cameras.width, cameras.height)
+    limits = (SH_C0, NEAR_LOG, FAR_LOG, MIN_SURFACE_OPACITY)
+    sums = np.zeros((len(points), SUM_COLUMNS))
+    m = members
     neighbors = np.sort(order_others(camera_distances(cameras))[:, :most], 1).astype(np.int32)
 
     def add_sums(begin: int) -> None:
@@ -56,7 +59,8 @@ def cross_view_stats(
 
     parallel_map(add_sums, range(0, len(points), STATS_ROWS))
     seen, same, behind, in_front, color_differences, depth_differences = sums.T
-    num_seen, num_same = np.maximum(seen, 1), np.maximum(same, 1)
+    num_seen = np.maximum(seen, 1)
+    num_same = np.maximum(same, 1)
     shares = [same / num_seen, behind / num_seen, in_front / num_seen, color_differences / num_same]
     stats[:, :-1] = np.stack([log(1 + seen) / 3, *shares, depth_differences / num_seen / FAR_LOG], 1)
     return stats

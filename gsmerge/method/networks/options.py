@@ -115,7 +115,8 @@ class NetworkOptions(Settings):
 
 def weight_shapes(options: NetworkOptions) -> dict[str, tuple[int, ...]]:
     """Return the shape of each weight of the networks by its name."""
-    width, latent = options.width, options.latent
+    width = options.width
+    latent = options.latent
     shapes = dict[str, tuple[int, ...]]()
     if options.encoder:
         shapes |= _set_network("encoder.set", MEMBER_COLUMNS, options)

@@ -34,7 +34,8 @@ def quat_to_rotmat(quats: Tensor) -> Tensor:
 def rotate_quats(vectors: Tensor, quats: Tensor) -> Tensor:
     """Rotate quaternions ``[n,4]`` by rotation vectors ``[n,3]`` in world axes."""
     half = (vectors.square().sum(-1, keepdim=True) + 1e-20).sqrt() / 2  # the addend makes the gradient at zero finite
-    w, (x, y, z) = half.cos()[:, 0], (half.sin() / (2 * half) * vectors).unbind(-1)
+    w = half.cos()[:, 0]
+    x, y, z = (half.sin() / (2 * half) * vectors).unbind(-1)
     a, b, c, d = quats.unbind(-1)
     return torch.stack(
         [w * a - x * b - y * c - z * d, w * b + x * a + y * d - z * c,
@@ -56,7 +57,8 @@ def skew_vectors(matrices: Tensor) -> Tensor:
 def move_tensors(gaussians: Gaussians, residuals: Tensor, frames: Tensor) -> Gaussians:
     """Apply corrections ``residuals [n,13]`` to Gaussians, in ``frames [n,3,3]`` whose columns are axes."""
     g = gaussians
-    opacities, factor = g.opacities, torch.exp(residuals[:, LOGIT_COLUMN])
+    opacities = g.opacities
+    factor = torch.exp(residuals[:, LOGIT_COLUMN])
     return replace(
         g,
         means=g.means + rotate_vectors(frames, residuals[:, MEAN_COLUMNS] * gaussian_sizes(g.scales)[:, None]),

@@ -49,7 +49,8 @@ def describe_features(
     ``num_members [g]`` are their numbers of members.
     """
     bare = make_group_features(features, views, np.zeros((len(features), GROUP_COLUMNS), np.float32), cameras)
-    base, group = bare.base, np.empty((len(features), GROUP_COLUMNS), np.float32)
+    base = bare.base
+    group = np.empty((len(features), GROUP_COLUMNS), np.float32)
     columns = (in_order(getattr(features, name)) for name in ("covars", "masses", "extinctions", "weights"))
     describe_groups(
         base.means, base.scales, base.opacities, base.sh0, *columns, num_members, bare.footprints,
@@ -67,7 +68,8 @@ def make_group_features(
     ``views [g]`` define the frames of the Feature Gaussians.
     """
     base = contiguous(feature_to_gaussians(features))
-    frames, sizes = np.empty((len(features), 3, 3), np.float32), np.empty(len(features), np.float32)
+    frames = np.empty((len(features), 3, 3), np.float32)
+    sizes = np.empty(len(features), np.float32)
     place_frames(base.means, base.scales, _contiguous_viewmats(cameras), views, frames, sizes)
     return GroupFeatures(features, base, frames, sizes, in_order(features.footprints), views, group)
 
@@ -116,7 +118,8 @@ def part_tokens(
 
     ``owners [n]`` are the groups. Members have ``MEMBER_COLUMNS`` columns, all other Gaussians ``PART_COLUMNS``.
     """
-    g, out = group_features, np.zeros((len(ids), columns), np.float32)
+    g = group_features
+    out = np.zeros((len(ids), columns), np.float32)
     describe_parts(
         parts.means, parts.quats, parts.scales, parts.opacities, parts.sh0, g.base.means, g.base.sh0, g.frames,
         g.sizes, g.footprints, ids.astype(np.int64, copy=False), owners, columns == MEMBER_COLUMNS, out,

@@ -130,8 +130,10 @@ class NetworkWeights:
         self, name: str, query: np.ndarray, context: np.ndarray, mask: np.ndarray, residual: np.ndarray
     ) -> np.ndarray:
         """Let tokens ``query [b,q,w]`` attend to ``context [b,n,w]``, and add ``residual [b,q,w]`` to the outputs."""
-        (sets, queries, width), heads = query.shape, self.options.heads
-        query, pairs = self._dense(f"{name}.query", query), self._dense(f"{name}.pair", context)
+        sets, queries, width = query.shape
+        heads = self.options.heads
+        query = self._dense(f"{name}.query", query)
+        pairs = self._dense(f"{name}.pair", context)
         mixed = np.empty((sets, queries, heads * padded(width // heads)), np.float32)
         scratch = np.empty(scratch_size(context.shape[1], width), np.float32)
         attend(query, pairs, np.ascontiguousarray(mask).view(np.uint8), heads, scratch, mixed)
@@ -165,18 +167,23 @@ class NetworkWeights:
 
         Layers before and after attention are padded with zeros, so that the values of each head fill whole vectors.
         """
-        width, heads = self.options.width, self.options.heads
+        width = self.options.width
+        heads = self.options.heads
         size = width // heads
         padded_columns = np.arange(width) // size * padded(size) + np.arange(width) % size
         layers = dict[str, Layer]()
         for name in [name.removesuffix(".weight") for name, array in self.arrays.items() if array.ndim == 2]:
-            weight, bias = self.arrays[f"{name}.weight"], self.arrays[f"{name}.bias"]
+            weight = self.arrays[f"{name}.weight"]
+            bias = self.arrays[f"{name}.bias"]
             if name.endswith("attention.pair"):  # outputs are keys, which are not padded, and values
                 rows = np.concatenate([np.arange(width), width + padded_columns])
                 num_rows = width + heads * padded(size)
-                padded_weight, padded_bias = np.zeros((num_rows, width), np.float32), np.zeros(num_rows, np.float32)
-                padded_weight[rows], padded_bias[rows] = weight, bias
-                weight, bias = padded_weight, padded_bias
+                padded_weight = np.zeros((num_rows, width), np.float32)
+                padded_bias = np.zeros(num_rows, np.float32)
+                padded_weight[rows] = weight
+                padded_bias[rows] = bias
+                weight = padded_weight
+                bias = padded_bias
             elif name.endswith("attention.out"):  # inputs are means of the values
                 padded_weight = np.zeros((width, heads * padded(size)), np.float32)
                 padded_weight[:, padded_columns] = weight

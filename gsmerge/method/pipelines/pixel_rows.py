@@ -33,7 +33,8 @@ def build_from_pixels(prepared: Prepared, plan: Plan, count: int | None) -> Fitt
     empty, as after a crop. If the plan has to fill the budget, or drops nothing, only as many unseen Gaussians are
     dropped as new Gaussians are added. Trials and an unchanged input are returned as they are.
     """
-    scene, start = prepared.scene, merge_views(prepared, plan, count)
+    scene = prepared.scene
+    start = merge_views(prepared, plan, count)
     if start.is_input and (plan.fit.fit == "none" or prepared.reference.name == RENDERS):
         return Fitted(start.gaussians, scene.cameras, None)  # the pictures show exactly these Gaussians
     fitted = fit_scene(start, scene, plan.fit, plan.seed)

@@ -26,25 +26,34 @@ HELD_OUT = 8  # every HELD_OUT-th placed camera is not used in the fit, but only
 FITTED = 16  # cameras of each kind to which a scene without cameras is fitted; on a walk half as many
 CANDIDATE_GAUSSIANS = 40_000  # candidates are chosen by pictures of at most this many Gaussians
 AROUND_CAMERAS = 40  # candidate cameras around the scene
-FAR_RADII, NEAR_RADII = 2.0, 1.2  # distances of cameras around the scene, in its radii
+# distances of cameras around the scene, in its radii
+FAR_RADII = 2.0
+NEAR_RADII = 1.2
 INSIDE = (0.0, -0.5, 0.5)  # positions of cameras inside, along each axis, as a share of half the extent
 INSIDE_DIRECTIONS = 8  # directions in which cameras look from each position inside
 FIELD = 1.0  # width of the image, divided by the focal length
 # Cameras at a viewer's place: width of the image divided by the focal length (80 degrees), and size of a pixel in
 # standard deviations of Gaussians
-INSIDE_FIELD, INSIDE_PIXEL = 5 / 3, 1.5
+INSIDE_FIELD = 5 / 3
+INSIDE_PIXEL = 1.5
 PROBE = 96  # pixels per side of the pictures for choosing candidates
-SMALLEST_PIXELS, LARGEST_PIXELS = 96, 640  # pixels per side
+# pixels per side
+SMALLEST_PIXELS = 96
+LARGEST_PIXELS = 640
 NEAR_PLANE_SHARE = 0.02  # near plane, as a share of the scene's radius
 # A camera is placed between a view and each of its PAIRS nearest views, at the share MIDDLE of the way
-PAIRS, MIDDLE = 2, 0.5
+PAIRS = 2
+MIDDLE = 0.5
 WIDEST = np.pi / 4  # the space between two views is unknown if the angle between their directions is larger
 # A fit to renders of at most this many views also gets renders between them, because it would memorise so few views
 FEW_RENDERED_VIEWS = 24
-OUTSIDE_SHARE, MOST_OUTSIDE = 0.5, 24  # number of views from outside as a share of all views, and its maximum
+# number of views from outside as a share of all views, and its maximum
+OUTSIDE_SHARE = 0.5
+MOST_OUTSIDE = 24
 # Bounds of views from outside: step backwards as a share of the depth, rotation to the sides and rotation up or down in
 # degrees
-OUTSIDE_LOW, OUTSIDE_HIGH = (0.0, -15.0, -10.0), (0.6, 15.0, 10.0)
+OUTSIDE_LOW = (0.0, -15.0, -10.0)
+OUTSIDE_HIGH = (0.6, 15.0, 10.0)
 
 
 VIEWER_VIEWS = (
@@ -152,7 +161,8 @@ def place_around(gaussians: Gaussians, count: int = FITTED) -> Cameras:
     means = thin_out(gaussians, CANDIDATE_GAUSSIANS).means.astype(np.float64)
     centre, half = _robust_box(means)
     outside = [_viewmats_around(centre, half, radii, spread_directions(count)) for radii in (FAR_RADII, NEAR_RADII)]
-    chosen, middle = place_cameras(gaussians, count), np.median(means, axis=0)
+    chosen = place_cameras(gaussians, count)
+    middle = np.median(means, axis=0)
     # the cameras of the walk look to all sides along the longest axis of the box
     _, side, along = np.eye(3)[np.argsort(half, kind="stable")]
     num_steps = count // 2
@@ -180,7 +190,8 @@ def draw_around(scene: PicturedScene) -> PicturedScene:
 
     The renders come last. A scene with a single view is returned as it is.
     """
-    means, views = scene.gaussians.means, len(scene)
+    means = scene.gaussians.means
+    views = len(scene)
     if views == 1:
         return scene
     count = min(int(OUTSIDE_SHARE * views), MOST_OUTSIDE)
@@ -216,7 +227,8 @@ def between_cameras(cameras: Cameras, *further: float) -> Cameras:
     pairs, shares = (np.array(column) for column in zip(*half_way.items(), *at_shares, strict=True))
     motions = motion_vectors(viewmats[pairs[:, 0]], viewmats[pairs[:, 1]])
     is_narrow = (motions[:, :3] ** 2).sum(1) <= WIDEST**2
-    views, moves = pairs[is_narrow, 0], motion_matrices((shares[:, None] * motions)[is_narrow])
+    views = pairs[is_narrow, 0]
+    moves = motion_matrices((shares[:, None] * motions)[is_narrow])
     return replace(cameras, viewmats=matmul(viewmats[views], moves), Ks=cameras.Ks[views])
 
 
@@ -314,7 +326,8 @@ def choose_candidates(
     shares = np.stack(parallel_map(view_shares, range(len(candidates))))  # [c,n]
     if counting is not None:
         shares = shares[:, counting]
-    seen, chosen = np.zeros(shares.shape[1], np.float32), list[int]()
+    seen = np.zeros(shares.shape[1], np.float32)
+    chosen = list[int]()
     for _ in range(num_views):
         gains = np.maximum(shares - seen, 0).sum(1, dtype=np.float64)
         best = int(gains.argmax())

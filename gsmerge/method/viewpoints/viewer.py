@@ -24,7 +24,8 @@ LIKELY = 1.1
 CELLS = 100  # cells of directions, half of which the scene has to cover
 # The radius of the empty space around a viewer is FREE times the distance within which the share NEAR_SHARE of the
 # Gaussians lies
-FREE, NEAR_SHARE = 0.25, 0.05
+FREE = 0.25
+NEAR_SHARE = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +42,8 @@ def find_viewer(gaussians: Gaussians) -> Viewer | None:
 
     Returns None if sizes do not grow with the distance from any place, or if too many directions show nothing.
     """
-    means, sizes = gaussians.means.astype(np.float64), np.sort(gaussians.scales, 1)[:, 1].astype(np.float64)
+    means = gaussians.means.astype(np.float64)
+    sizes = np.sort(gaussians.scales, 1)[:, 1].astype(np.float64)
     if not sizes.all() or _spread_of_logs(sizes) == 0:
         return None
     # The search has two starts: the middle of the smaller Gaussians, which are nearer, and a direct solution. The
@@ -101,6 +103,7 @@ def _spread_of_logs(values: np.ndarray) -> float:
 def spread_directions(count: int) -> np.ndarray:
     """Return directions ``[count,3]`` that are spread evenly over the sphere (golden spiral)."""
     i = np.arange(count) + 0.5
-    height, angle = 1 - 2 * i / count, GOLDEN * i
+    height = 1 - 2 * i / count
+    angle = GOLDEN * i
     radius = np.sqrt(1 - height**2)
     return np.stack([radius * cos(angle), height, radius * sin(angle)], 1)
