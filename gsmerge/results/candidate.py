@@ -33,7 +33,8 @@ class Candidate:
 def score(fitted: Fitted, prepared: Prepared, plan: Plan, count: int | None = None) -> Candidate:
     """Move fitted canonical Gaussians into the world, and measure their PSNR; ``count`` is the number asked for."""
     moved = with_moved_views(prepared, fitted.cameras)
-    gaussians, cameras = moved.frame.leave(fitted.gaussians), moved.input_scene.cameras
+    gaussians = moved.frame.leave(fitted.gaussians)
+    cameras = moved.input_scene.cameras
     if cameras is not prepared.input_scene.cameras:
         input_scene = prepared.input_scene
         cause = "poses are free" if plan.free_poses else "the photos of some views agree only under other poses"
@@ -66,7 +67,8 @@ def _measure_candidate(gaussians: Gaussians, moved: Prepared, plan: ScorePlan) -
             compared = measure_renders(canonical, moved, plan)
         # If the input leaves gaps, only the pixels that it covers count
         fidelity = compared.psnr if plan.covered is None else compared.covered_psnr
-        views, placed = len(plan.views), moved.reference.placed
+        views = len(plan.views)
+        placed = moved.reference.placed
         record_choices(fidelity={"psnr": fidelity, "views": views, "held_out": placed})
         return fidelity, fidelity
     measured = measure_result(gaussians, moved, plan, None if plan.before is None else plan.before.covered)

@@ -27,8 +27,12 @@ TWICE_DB = decibels(1 / 4)  # dB between two errors of which one is twice the ot
 # DISTANCE_GAUSSIANS stands for the input. The pictures are blurred by a standard deviation of DISTANCE_BLUR pixels, so
 # that noise of single Gaussians hardly counts. On fifteen captures, every result is nearer to its input than the input
 # is to the photos, by .2 dB or more. Measuring takes .03 s
-DISTANCE_GAUSSIANS, DISTANCE_PIXELS, DISTANCE_BLUR = 40_000, 80, 1.0
-MOST_PHOTOS, MOST_BETWEEN = 2, 3  # most photos that are compared, and most cameras that are placed between views
+DISTANCE_GAUSSIANS = 40_000
+DISTANCE_PIXELS = 80
+DISTANCE_BLUR = 1.0
+# most photos that are compared, and most cameras that are placed between views
+MOST_PHOTOS = 2
+MOST_BETWEEN = 3
 
 
 def is_clearly_worse(input_psnr: float | None, result_psnr: float | None) -> bool:
@@ -46,11 +50,13 @@ def describe_clear_loss(gaussians: Gaussians, prepared: Prepared) -> str | None:
 
     ``gaussians`` are the canonical Gaussians of the result. The scene has photos.
     """
-    scene, views = prepared.scene, prepared.reference.score_views
+    scene = prepared.scene
+    views = prepared.reference.score_views
     photo_views = [views[i] for i in even_views(len(views), min(len(views), MOST_PHOTOS))]
     share = DISTANCE_PIXELS / max(DISTANCE_PIXELS, scene.cameras.width, scene.cameras.height)
     size = [max(1, round(side * share)) for side in (scene.cameras.width, scene.cameras.height)]
-    sample, cameras = sample_gaussians(scene, DISTANCE_GAUSSIANS), resize_cameras(scene.cameras, *size)
+    sample = sample_gaussians(scene, DISTANCE_GAUSSIANS)
+    cameras = resize_cameras(scene.cameras, *size)
     between = between_cameras(cameras[list(views)]) if len(views) > 1 else cameras[[]]
     if len(between) > 0:
         between = between[even_views(len(between), min(len(between), MOST_BETWEEN))]
@@ -94,7 +100,8 @@ def _measure_left_out(
     left_out = shrink_pictures(left_out_pixels.astype(np.float32), *size) == 1
     if not left_out.any():
         return None
-    pictures, empty = shrink_pictures(scene.images[views], *size), shrink_pictures(scene.empty[views], *size)
+    pictures = shrink_pictures(scene.images[views], *size)
+    empty = shrink_pictures(scene.empty[views], *size)
     drawn = render(gaussians, cameras[views])
     errors = (drawn.images - pictures)[left_out]
     on_white = errors + (1 - drawn.alphas - empty[..., None])[left_out]

@@ -19,7 +19,8 @@ from gsmerge.settings.compact import OURS, TRIAL, CompactOptions
 from gsmerge.types import Gaussians, PicturedScene
 
 # One of every LEFT_OUT_PART views is left out at a time, but at most MOST_LEFT_OUT views
-LEFT_OUT_PART, MOST_LEFT_OUT = 6, 3
+LEFT_OUT_PART = 6
+MOST_LEFT_OUT = 3
 LEAST_SEEN = 0.02  # a left-out photo counts if the other views see more than this share of it
 
 

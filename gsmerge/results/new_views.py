@@ -40,13 +40,16 @@ TRIAL_VIEWS = 64
 # Gaussians per pixel than the result. If the result has x times the usual number of Gaussians per pixel, the trial has
 # x to the power of SHARE_POWER times the usual number. On five captures, for results with 1 % of the Gaussians, this
 # lowers the error of the estimated gain from 2.3 to 1.0 dB
-USUAL_DENSITY, SHARE_POWER = parse_share(SHARE), 0.3
+USUAL_DENSITY = parse_share(SHARE)
+SHARE_POWER = 0.3
 # The expected gain of new views is a weighted mean of two gains: the gain of the result's own photos, as far as depth
 # is confirmed, with the weight OWN_WEIGHT, and the gain of left-out photos in the trial. On ten captures and on five
 # others, the true gain of at least 80 % of the results lies between these two gains, or at most SPREAD dB outside of
 # them (docs/internals/decisions.md#new-views). Nothing is known about results with more than MOST_SHARE Gaussians for
 # each pixel
-OWN_WEIGHT, SPREAD, MOST_SHARE = 0.2, 1.25, 0.1
+OWN_WEIGHT = 0.2
+SPREAD = 1.25
+MOST_SHARE = 0.1
 
 
 @dataclass(frozen=True)
@@ -70,7 +73,9 @@ class Trial:
         least_gain = min(self.after - self.before, most_gain)
         before = own_before + self.before - self.own_before
         after = before + OWN_WEIGHT * most_gain + (1 - OWN_WEIGHT) * least_gain
-        low, high = round(least_gain - SPREAD, 2), round(most_gain + SPREAD, 2)  # files have two digits
+        # files have two digits
+        low = round(least_gain - SPREAD, 2)
+        high = round(most_gain + SPREAD, 2)
         return NewViews(round(before, 2), round(after, 2), low, high, self.views)
 
 
@@ -151,7 +156,8 @@ def shrink_scene(scene: PicturedScene, step: int) -> PicturedScene:
     A new pixel gets the front Gaussian of the old pixel in its middle. The scales of this Gaussian become ``step``
     times as large.
     """
-    cameras, shape = scene.cameras, scene.images.shape[1:3]
+    cameras = scene.cameras
+    shape = scene.images.shape[1:3]
     height, width = (max(1, side // step) for side in shape)
     Ks = cameras.Ks / np.array([[step], [step], [1]], cameras.Ks.dtype)
     cut = slice(None), slice(0, height * step), slice(0, width * step)

@@ -53,7 +53,8 @@ def name_outputs(result: Path, options: FileOptions | None = None, *, overwrite:
 
     Raises UsageError if the name has no ending that can be written, or if the options do not fit the format.
     """
-    options, format_ = options or FileOptions(), output_format(result)
+    options = options or FileOptions()
+    format_ = output_format(result)
     if options.columns == "full" and not (format_.columns and options.normals):
         raise UsageError(f"columns full: expected a .ply output with normals, got {result.name}")
     if options.place is not None and format_ is not TILESET:
@@ -82,7 +83,8 @@ def settings_for(outputs: Outputs, settings: CompactOptions, *, has_levels: bool
     If ``has_levels`` is false, the format of the output chooses the number of levels. Raises UsageError if there are
     several levels, or a budget in bytes, and the format cannot have these.
     """
-    out, format_ = outputs.result, outputs.format
+    out = outputs.result
+    format_ = outputs.format
     if format_.levels == "inside" and settings.method == OURS and not has_levels:
         settings = settings.with_settings({"levels": STREAMED_LEVELS})
     budget = settings.budget
@@ -121,7 +123,9 @@ def add_outputs(add: AddOutput, outputs: Outputs, temporary: Path, contents: Con
     the file, or in a file of settings beside it. If the scene has no camera, one is placed for these viewers. A file of
     settings that exists already stays unchanged, unless gsmerge wrote it and may overwrite files.
     """
-    format_, gaussians, has_views = outputs.format, contents.levels[0], len(contents.cameras) > 0
+    format_ = outputs.format
+    gaussians = contents.levels[0]
+    has_views = len(contents.cameras) > 0
     contents = replace(contents, options=outputs.options)
     if outputs.viewer_cameras is not None and has_views:
         if outputs.overwrite or not outputs.viewer_cameras.exists():
@@ -142,7 +146,8 @@ def add_outputs(add: AddOutput, outputs: Outputs, temporary: Path, contents: Con
 
 def frame_notes(outputs: Outputs, cameras: Cameras) -> list[str]:
     """Return notes if viewers of the format will not show the scene upright, or not at its place on the globe."""
-    format_, notes = outputs.format, list[str]()
+    format_ = outputs.format
+    notes = list[str]()
     if format_ is TILESET and outputs.options.place is None:
         notes.append("without a place the scene lies in the middle of the earth: --set place=LON,LAT,HEIGHT")
     if len(cameras) and (format_.first_view or format_ is TILESET):
@@ -162,7 +167,8 @@ def refuse_to_replace_cameras(path: Path, cameras: Cameras, names: Sequence[str]
     """
     is_same = False
     with suppress(SceneError):  # a file that cannot be read has no cameras
-        file, farthest = read_cameras(path), np.abs(cameras.viewmats[:, :3, 3]).max(initial=1)
+        file = read_cameras(path)
+        farthest = np.abs(cameras.viewmats[:, :3, 3]).max(initial=1)
         stored = to_cameras(file)
         same_views = [*file.names, stored.width, stored.height] == [*names, cameras.width, cameras.height]
         same_poses = same_views and (

@@ -184,7 +184,8 @@ def report_document(
         :class:`CompactReport`, partly under other names, and facts about the files. ``worse`` is the warning of the
         result or, if it has none, of a level. Within a ``schema_version`` keys are only added.
     """
-    numbers, at = asdict(report), written_at or {}
+    numbers = asdict(report)
+    at = written_at or {}
     return {
         **document_head(),
         "input": {**recognised, "num_gaussians": numbers["num_input"]},
@@ -235,11 +236,14 @@ def result_table(document: Mapping[str, Any], next_step: str | None = None, *, c
 
     Lines are broken at ``columns`` characters, except for paths and ``next_step``, which people copy.
     """
-    files, psnr, choices = (document["input"], document["output"]), document["psnr_input_views"], document["choices"]
+    files = (document["input"], document["output"])
+    psnr = document["psnr_input_views"]
+    choices = document["choices"]
     reference = document.get("psnr_reference")
     pictures = "its own photos" if reference in (None, "photos") else str(reference)  # to which the result was fitted
     # A row has a name, the value before and after, and a short explanation
-    counts, sizes = [f"{file['num_gaussians']:,}" for file in files], [human_bytes(file["bytes"]) for file in files]
+    counts = [f"{file['num_gaussians']:,}" for file in files]
+    sizes = [human_bytes(file["bytes"]) for file in files]
     rows = [("Gaussians", counts[0], counts[1], human_share(document["ratio"])), ("file", sizes[0], sizes[1], "")]
     if new := document["new_views"]:
         gain = f"about {new['after'] - new['before']:+.1f} dB, from {new['views']} photos left out"
@@ -255,7 +259,8 @@ def result_table(document: Mapping[str, Any], next_step: str | None = None, *, c
     }
     for words, score in scores.items():
         if score:
-            name, about = pictures if score is psnr else "", words.format(100 * score.get("share", 0))
+            name = pictures if score is psnr else ""
+            about = words.format(100 * score.get("share", 0))
             rows += [(name, psnr_figure(score["before"], choices), psnr_figure(score["after"], choices), about)]
     if fidelity := choices.get("fidelity"):
         rows += [("PSNR", "", psnr_words(fidelity["psnr"]), _describe_fidelity_views(fidelity))]
@@ -292,7 +297,8 @@ def curve_lines(document: Mapping[str, Any]) -> list[str]:
     The scores are measured on photos, or patches of photos, that the fits left out. The row nearest to the number of
     Gaussians in the result is marked. Empty if no curve was measured.
     """
-    points, count = document["choices"].get("curve"), document["output"]["num_gaussians"]
+    points = document["choices"].get("curve")
+    count = document["output"]["num_gaussians"]
     if not points:
         return []
     head = f"{'Gaussians':>12}  {'PSNR':>5}  {'SSIM':>5}"

@@ -88,9 +88,11 @@ class CompactResult:
             >>> result.save("demo/small.sog", overwrite=True).name
             'small.sog'
         """
-        cameras, levels = self.cameras.numpy(), [level.gaussians.numpy() for level in (self, *self.coarser)]
+        cameras = self.cameras.numpy()
+        levels = [level.gaussians.numpy() for level in (self, *self.coarser)]
         outputs = name_outputs(Path(path), overwrite=overwrite)
-        names, comments = self.names or number_views(len(cameras)), result_comments(self.report.new_views)
+        names = self.names or number_views(len(cameras))
+        comments = result_comments(self.report.new_views)
         write_outputs(outputs, Contents(levels, comments, cameras, names, outputs.result.stem))
         return outputs.result
 
@@ -125,7 +127,8 @@ class CompactResult:
 
     def for_scene(self, scene: Scene) -> CompactResult:
         """Return the result of a scene in memory: with arrays of the scene's kind, and a weak reference to it."""
-        result, means = self.to(scene.gaussians.device), scene.gaussians.means
+        result = self.to(scene.gaussians.device)
+        means = scene.gaussians.means
         if isinstance(means, np.ndarray) and means.dtype == np.float32:
             result = result.to_single()
         return replace(result, scene=ref(scene), names=scene.names)
@@ -145,7 +148,8 @@ def make_result(best: Candidate, levels: Sequence[Candidate], prepared: Prepared
     the photos. If a sample shows that a result may be worse than the input, this function starts again with all photos.
     The report contains the seconds, choices and notes of the current record, and those of a level its own.
     """
-    input_scores, candidates = score_input(prepared, plan.score), (best, *levels)
+    input_scores = score_input(prepared, plan.score)
+    candidates = (best, *levels)
     before = None if input_scores.photos is None else input_scores.photos.psnr
     part_scores = [
         measure_parts(
@@ -189,7 +193,8 @@ def _report(
 
     ``before`` is the PSNR (dB) of the input. The report says whether the level is worse than the input.
     """
-    reference, record = prepared.reference, candidate.record
+    reference = prepared.reference
+    record = candidate.record
     rendered = reference.name == RENDERS
     after = None if rendered else candidate.psnr
     report = CompactReport(
@@ -205,7 +210,8 @@ def _report(
     if rendered and level == 0 and not plan.clean.visible_drops:  # coarser levels are meant to differ
         worse = describe_distance(candidate.psnr)
     elif reference.of_views and not plan.clean.visible_drops:
-        name, pictures = f"level {level}" if level else "the result", reference.name
+        name = f"level {level}" if level else "the result"
+        pictures = reference.name
         compared = compared_psnr(parts.covered, before, after)
         clear_loss = describe_clear_loss(candidate.fitted.gaussians, prepared) if level == 0 else None
         report = replace(report, is_far=clear_loss is not None or is_clearly_worse(*compared))

@@ -21,7 +21,8 @@ from gsmerge.types import Gaussians, Scene
 # The input is scored on one of INPUT_EVERY tiles of the photos. A result is scored on one of RESULT_EVERY tiles,
 # because the far fewer Gaussians of a result are drawn faster. On fifteen captures, the gain (result minus input) on
 # such tiles differs by .27 dB (rms) from the gain on whole photos
-INPUT_EVERY, RESULT_EVERY = 10, 2
+INPUT_EVERY = 10
+RESULT_EVERY = 2
 
 
 def compares_all_pixels(before: PhotoScore | None) -> bool:
@@ -59,7 +60,8 @@ def measure_result(
     """
     if not prepared.reference.of_views:
         return None
-    every, views = RESULT_EVERY if covered is None else INPUT_EVERY, prepared.result_views()
+    every = RESULT_EVERY if covered is None else INPUT_EVERY
+    views = prepared.result_views()
     return _score_photos("score", round_for_output(gaussians, plan), views, prepared, plan, covered, every)
 
 
@@ -91,7 +93,9 @@ def _score_photos(
     If the plan allows samples, only one of ``every`` tiles of the photos counts.
     """
     with stage(name):
-        near, every, photos = NEAR_PLANE * prepared.frame.unit, every if plan.samples else 1, scene_photos(views)
+        near = NEAR_PLANE * prepared.frame.unit
+        every = every if plan.samples else 1
+        photos = scene_photos(views)
         return score_photos(gaussians, photos, plan.views, every=every, near=near, covered=covered)
 
 
@@ -121,7 +125,8 @@ def _measure_protected(gaussians: Gaussians, prepared: Prepared, plan: ScorePlan
         assert views.protected is not None
         protected_ids = np.flatnonzero(views.protected.any((1, 2))).tolist()
         ids = [protected_ids[i] for i in scored_views(len(protected_ids))]
-        near, masks = NEAR_PLANE * prepared.frame.unit, list(views.protected[ids])
+        near = NEAR_PLANE * prepared.frame.unit
+        masks = list(views.protected[ids])
         score = score_photos(gaussians, scene_photos(views), ids, near=near, covered=masks)
         return replace(score, share=float(views.protected.mean()))
 
@@ -137,7 +142,8 @@ class InputScores:
 
 def score_input(prepared: Prepared, plan: ScorePlan) -> InputScores:
     """Score the Gaussians of the input. The plan may already have the score on the scored photos."""
-    photos, gaussians = plan.before or measure_input(prepared, plan), prepared.input_scene.file_gaussians
+    photos = plan.before or measure_input(prepared, plan)
+    gaussians = prepared.input_scene.file_gaussians
     return InputScores(
         photos, _measure_on_files(gaussians, prepared, plan), _measure_protected(gaussians, prepared, plan)
     )
@@ -161,7 +167,8 @@ def measure_parts(before: InputScores, gaussians: Gaussians, prepared: Prepared,
 
     ``before`` has the scores of the input, which are returned together with the scores of the result.
     """
-    parts, photos = PartScores(), before.photos
+    parts = PartScores()
+    photos = before.photos
     # The covered pixels have no score of their own if the input covers nearly all pixels, or if the masks of the photos
     # leave out all uncovered pixels anyway
     if photos is not None and not compares_all_pixels(photos) and prepared.scene.empty is None:

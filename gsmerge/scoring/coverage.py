@@ -27,7 +27,8 @@ def extents(gaussians: Gaussians) -> dict[str, Any]:
     if len(gaussians) == 0:
         return {"box_low": [0.0] * 3, "box_high": [0.0] * 3, **dict.fromkeys(names, 0.0)}
     step = -(-len(gaussians) // VISIBILITY_GAUSSIANS)
-    points, largest = gaussians.means[::step].astype(np.float64), gaussians.scales.max(1)
+    points = gaussians.means[::step].astype(np.float64)
+    largest = gaussians.scales.max(1)
     low, high = np.percentile(points, BOX_QUANTILES, axis=0)
     diagonal = np.linalg.norm(high - low)
     huge_scale_share = 0.1  # scales above this share of the box's diagonal are huge, since they show no detail
@@ -51,7 +52,8 @@ def coverage(scene: Scene) -> list[dict[str, Any]]:
     shares = shares_inside(scene, VISIBILITY_GAUSSIANS)
     pixels: list[float | None] = [None] * len(scene)
     if scene.has_own_pixels:
-        pixel_rows, covered = scene.get_pixels(), scene.covered
+        pixel_rows = scene.get_pixels()
+        covered = scene.covered
         has_row = pixel_rows.shown if covered is None else covered
         visible = has_row & (scene.gaussians.opacities >= LEAST_OPACITY)[pixel_rows.fronts]
         pixels = [float(view.mean()) for view in visible]

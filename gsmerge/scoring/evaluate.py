@@ -264,7 +264,8 @@ def evaluate(
     for name, gaussians in scored.items():
         timed_views = [view for views_by_name in split_scores for view in views_by_name[name]]
         seconds = float(np.median([seconds for seconds, _ in timed_views]))
-        views, ratio = tuple(view for _, view in timed_views), len(gaussians) / max(len(inputs), 1)
+        views = tuple(view for _, view in timed_views)
+        ratio = len(gaussians) / max(len(inputs), 1)
         scores.append(ResultScores(name, len(gaussians), ratio, seconds, views, fog.get(name, {}), marks[name]))
     counts = {name: len(split.scored) for name, split in splits.items()}
     notes = (*lpips_notes, *_describe_scores(splits, scores, mended=mended))
@@ -291,7 +292,8 @@ def _find_marks(
     """Return the scene as it is drawn, and by name of the input and of each result, whether it is drawn antialiased."""
     marks = {name: moved.antialiased for name, moved in cameras.items()}
     if options.antialiased is not None:
-        scene, marks = replace(scene, cameras=replace(scene.cameras, antialiased=options.antialiased)), {}
+        scene = replace(scene, cameras=replace(scene.cameras, antialiased=options.antialiased))
+        marks = {}
     return scene, {**dict.fromkeys((INPUT, *names), scene.cameras.antialiased), **marks}
 
 
@@ -337,7 +339,8 @@ def _make_splits(
 
     def make_split(views: Views, words: str, masks: np.ndarray | None = None) -> _Split:
         """Return a split; ``words`` describe the pictures of the views, and pixels outside ``masks`` do not count."""
-        visible, scored = visible_pixels(points, views.cameras, renderer.near, sources), list(range(len(views.names)))
+        visible = visible_pixels(points, views.cameras, renderer.near, sources)
+        scored = list(range(len(views.names)))
         if masks is not None:
             masks = np.stack([resize_mask(mask, cameras.width, cameras.height) for mask in masks])
             visible &= masks
@@ -374,7 +377,8 @@ def _score_split(
     the input views, or held-out ones. ``kind`` is its name. If a result was made with other poses than the scene's,
     ``cameras`` has its cameras. ``marks`` says, by name, which results are drawn antialiased.
     """
-    options, names = renderer.options, split.views.names
+    options = renderer.options
+    names = split.views.names
     lpips_views = pick_views(len(names), options.lpips_views or len(names))
     # Renders of the input keep the cameras that drew them
     moved = {} if split.reference == RENDERS else cameras
@@ -406,7 +410,8 @@ def _add_qualities(
     nets: Sequence[str],
 ) -> ViewScore:
     """Add to a view's score the quality of a render over all pixels, over seen pixels, and over ``covered`` pixels."""
-    photo, seen = split.views.images[view], split.visible[view]
+    photo = split.views.images[view]
+    seen = split.visible[view]
     share = None if covered is None else float(covered.mean())
     covered_mask = covered if share is not None and share < WHOLE_SHARE else None
     # PSNR and SSIM over the pixels in each mask. None stands for all pixels, and an empty mask gives no measures

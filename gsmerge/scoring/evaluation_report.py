@@ -109,10 +109,12 @@ def evaluation_csv(document: Mapping[str, Any]) -> str:
 
 def evaluation_tables(document: Mapping[str, Any]) -> Iterator[TextTable]:
     """Yield the text tables of an evaluation, each as a heading, columns and rows."""
-    results, sizes = document["results"], []
+    results = document["results"]
+    sizes = []
     input_size = results[0].get("bytes")
     for result in results:
-        size, bytes_by_attribute = result.get("bytes"), result.get("bytes_by_attribute", {})
+        size = result.get("bytes")
+        bytes_by_attribute = result.get("bytes_by_attribute", {})
         bytes_each = sum(bytes_by_attribute.values()) / max(result["num_gaussians"], 1)
         sizes.append((
             result["name"],
@@ -137,7 +139,8 @@ def _quality_tables(document: Mapping[str, Any], split: str) -> Iterator[TextTab
     The first table is over the pixels that the input views have seen, and the second table over the pixels that the
     input covers. The second table has no rows if the input covers nearly all pixels.
     """
-    results, count = document["results"], document["num_views"][split]
+    results = document["results"]
+    count = document["num_views"][split]
     quality = "Quality" if "target" in document["num_views"] else "No view was held out: quality"
     views = f"{quality} of {count} {SPLIT_WORDS[split]} view{'s' * (count > 1)}"
     means = [(result["name"], result["mean"][split]) for result in results]
@@ -176,7 +179,8 @@ def evaluation_lines(document: Mapping[str, Any], columns: int | None = None) ->
         if not all_rows:
             continue
         filled = [i for i in range(len(columns_of_table)) if i == 0 or any(row[i] for row in all_rows)]
-        head, rows = [columns_of_table[i] for i in filled], [[row[i] for i in filled] for row in all_rows]
+        head = [columns_of_table[i] for i in filled]
+        rows = [[row[i] for i in filled] for row in all_rows]
         omitted_first = [head.index(name) for name in OMITTED_FIRST if name in head]
         lines += wrap_line(heading, columns, 2)
         lines += text_table([head, *rows], "  ", letters=columns, omitted_first=omitted_first)

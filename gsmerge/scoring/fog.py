@@ -33,14 +33,18 @@ ALL = "all"  # kind that stands for the outside cameras of all kinds
 FOG_PIXELS = 480  # longer side of the pictures is at most this, pixels
 # A pixel of the input is empty if its opacity is below FOG_EMPTY, and solid if its opacity is above FOG_SOLID. A solid
 # pixel of the input is a hole of a result if the result has an opacity below FOG_OPEN in this pixel
-FOG_EMPTY, FOG_SOLID, FOG_OPEN = 0.05, 0.9, 0.5
+FOG_EMPTY = 0.05
+FOG_SOLID = 0.9
+FOG_OPEN = 0.5
 EROSION_PIXELS = 17  # side, in pixels, of the square that erodes empty regions
 VEIL_SHARE = 0.7  # a result has a veil where its depth is below this share of the input's depth
 VEILED = 0.08  # share of the pixels; a result whose worst veil is larger gets a note
 # A spike is a Gaussian whose longest scale is at least RATIOS times the second one, and whose length at 3 sigma is more
 # than LONG of the picture's width. A spike is visible where a channel changes by more than CHANGED if the spike is
 # removed
-RATIOS, LONG, CHANGED = (5.0, 3.0), 0.05, 0.05
+RATIOS = (5.0, 3.0)
+LONG = 0.05
+CHANGED = 0.05
 FOG_NEAR_PLANE = 0.25  # near plane of the depths of both scenes, as a share of the view's median depth
 
 
@@ -95,7 +99,8 @@ def measure_fog(
     keys of :data:`FOG_CAMERAS`, and "all". ``near`` is the near plane of the pictures, in world units. ``marks`` says,
     by name, whether a result is drawn antialiased, if it differs from the ``cameras``.
     """
-    reference_splats, marks = make_splats(reference), marks or {}
+    reference_splats = make_splats(reference)
+    marks = marks or {}
     splats = {name: make_splats(result) for name, result in results.items()}
     measured: dict[str, list[tuple[str, np.ndarray]]] = {name: [] for name in results}  # camera's kind, sums of pixels
     outside = list(fog_cameras(reference, cameras))
@@ -154,7 +159,8 @@ def sum_pixels(expected: OutsidePicture, actual: OutsidePicture) -> np.ndarray:
     Returns ``[4,2]`` with a row each for near fog, far fog, holes and veil. A row has a sum over pixels, and the number
     of pixels over which the sum was taken.
     """
-    empty, solid = (expected.opacities < FOG_EMPTY).astype(np.uint8), expected.opacities > FOG_SOLID
+    empty = (expected.opacities < FOG_EMPTY).astype(np.uint8)
+    solid = expected.opacities > FOG_SOLID
     far_share = 0.1  # fog is far if it is farther than this share of the width from every pixel that the input shows
     sides = EROSION_PIXELS, max(EROSION_PIXELS, 2 * round(far_share * empty.shape[1]) + 1)
     masks = [cv2.erode(empty, np.ones((side, side), np.uint8)) > 0 for side in sides]
@@ -173,7 +179,8 @@ def count_spikes(gaussians: Gaussians, camera: Cameras, near: float) -> np.ndarr
     _, second, longest = np.sort(gaussians.scales, 1).T
     depths = camera_depths(gaussians.means.astype(np.float64), camera.viewmats[0])
     is_long = 3 * longest * camera.Ks[0, 0, 0] > LONG * camera.width * np.maximum(depths, near)
-    image, counts = render(gaussians, camera, near=near).images[0], []
+    image = render(gaussians, camera, near=near).images[0]
+    counts = []
     for ratio in RATIOS:
         is_spike = is_long & (longest >= ratio * second)
         without_spikes = render(gaussians[~is_spike], camera, near=near).images[0] if is_spike.any() else image

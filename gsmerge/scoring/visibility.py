@@ -28,7 +28,8 @@ def context_points(scene: Scene, near: float, cameras: Cameras | None = None) ->
     """
     if scene.has_own_pixels:
         return scene.file_gaussians.means.astype(np.float64)
-    cameras, points = scene.cameras if cameras is None else cameras, []
+    cameras = scene.cameras if cameras is None else cameras
+    points = []
     for view in range(len(cameras)):
         camera = cameras[[view]]
         drawn = render(scene.gaussians, camera, near=near, with_depths=True)
