@@ -98,7 +98,8 @@ def compact_blocks(
     the same photos.
     """
     scene = scene.numpy()
-    count, limit = len(blocks), plan.count.limits.count
+    count = len(blocks)
+    limit = plan.count.limits.count
     if scene.images is not None:
         note(f"compacted in {count} blocks of views: photos keep their exposures, and new views are not estimated")
     with stage("partition"):
@@ -162,7 +163,8 @@ def join_reports(
     come from the current record. If the result may be worse than the input, result and input are scored again on all
     photos.
     """
-    run, num_views = current_record(), [len(start.block.own) for start in starts]
+    run = current_record()
+    num_views = [len(start.block.own) for start in starts]
 
     def mean(values: Sequence[float | None]) -> float | None:
         """Average a value of each block, weighted by the blocks' numbers of views; None if a block has no value."""
@@ -170,7 +172,8 @@ def join_reports(
         return None if len(numbers) < len(values) else float(np.average(numbers, weights=num_views))
 
     scored = sum(len(start.plan.score.views) for start, psnr in zip(starts, psnrs, strict=True) if psnr is not None)
-    before, after = mean([start.psnr_before for start in starts]), mean(psnrs)
+    before = mean([start.psnr_before for start in starts])
+    after = mean(psnrs)
     reference = None if before is None else starts[0].prepared.reference.name
     pictures = OWN_PHOTOS if reference == PHOTOS else reference
     may_be_worse = reference == PHOTOS and is_worse(before, after, SAMPLE_LOSS)
@@ -236,7 +239,9 @@ def fit_block(start: BlockStart, shared_start: tuple[Gaussians, np.ndarray], gro
     ``growth`` is the final number of Gaussians divided by the number at the start. ``number`` is that of the block.
     """
     begin_part("fit")
-    (joined, owners), scene, plan = shared_start, start.prepared.scene, start.plan
+    joined, owners = shared_start
+    scene = start.prepared.scene
+    plan = start.plan
     used = owners == number
     if plan.fit.fit != "none":
         used |= peak_weights(joined, blank_photos(scene.cameras, 2))[0] >= plan.fit.min_contribution

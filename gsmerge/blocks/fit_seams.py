@@ -24,7 +24,8 @@ FOREIGN_SHARE = 0.1  # a Gaussian is at a seam if other blocks' views have more 
 SEAM_VIEW_STEPS = 2  # steps for each view
 # If at least ROOM_SHARE of all Gaussians are at seams, the blocks show the same room from all sides, and the fit of the
 # seams takes ROOM_VIEW_STEPS steps for each view
-ROOM_SHARE, ROOM_VIEW_STEPS = 0.5, 4
+ROOM_SHARE = 0.5
+ROOM_VIEW_STEPS = 4
 # Step sizes in the fit of the seams, relative to the step sizes in other fits. They are smaller, because the Gaussians
 # at seams are already fitted, though beside Gaussians that are not in the result
 SEAM_RATE = 0.6
@@ -74,7 +75,9 @@ def find_seams(
 
     A Gaussian is at a seam if views of other blocks show it, too.
     """
-    total, foreign, splats = np.zeros(len(joined)), np.zeros(len(joined)), make_splats(joined)
+    total = np.zeros(len(joined))
+    foreign = np.zeros(len(joined))
+    splats = make_splats(joined)
     seam_views: list[list[int]] = [[] for _ in starts]
     for block, _, rows, weights in _view_weights(splats, starts):
         total[rows] += weights
@@ -94,8 +97,10 @@ def join_views(scene_views: Sequence[tuple[PicturedScene, list[int]]]) -> Pictur
 
     ``scene_views`` has pairs of a scene and the ids of its views to join.
     """
-    num_views, cameras = sum(len(ids) for _, ids in scene_views), scene_views[0][0].cameras
-    images, num_copied = make_array((num_views, cameras.height, cameras.width, 3), np.float32), 0
+    num_views = sum(len(ids) for _, ids in scene_views)
+    cameras = scene_views[0][0].cameras
+    images = make_array((num_views, cameras.height, cameras.width, 3), np.float32)
+    num_copied = 0
     for scene, ids in scene_views:
         for view in ids:
             images[num_copied] = scene.images[view]
@@ -115,7 +120,8 @@ def _view_weights(splats: Splats, starts: Sequence[BlockStart]) -> Iterator[tupl
     in the view. Views are numbered within the prepared scene of their block.
     """
     for block, start in enumerate(starts):
-        block_views, repeated = set(start.block.own), start.prepared.repeated
+        block_views = set(start.block.own)
+        repeated = start.prepared.repeated
         views = sorted({repeated[i] for i, view in enumerate(start.block.views) if view in block_views})
         photos = blank_photos(start.prepared.scene.cameras[views], 2)
 

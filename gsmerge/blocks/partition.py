@@ -159,14 +159,16 @@ def grow_blocks(weights: np.ndarray, count: int) -> np.ndarray:
     block grows by the free view that shares most with it.
     """
     num_views = len(weights)
-    labels, is_free = np.full(num_views, -1), np.ones(num_views, bool)
+    labels = np.full(num_views, -1)
+    is_free = np.ones(num_views, bool)
     for label in range(count):
         size = round(is_free.sum() / (count - label))
         free_weights = weights[:, is_free].sum(1)  # sum of the edges from each view to free ones
         block_weights = np.where(is_free, 0.0, -np.inf)  # sum of the edges from each free view to the block
         view = int(np.where(is_free, free_weights, np.inf).argmin())
         for _ in range(size):
-            labels[view], is_free[view] = label, False
+            labels[view] = label
+            is_free[view] = False
             block_weights += weights[view]
             block_weights[view] = -np.inf
             # prefer views with weak edges to other free views, so that no view remains alone

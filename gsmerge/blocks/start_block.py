@@ -48,7 +48,8 @@ def start_block(
     # see the Gaussian
     is_candidate = covisibility.weights[list(block.own)].sum(0) > 0
     is_candidate[list(block.own)] = True
-    means, candidates = frame.leave(decoded.gaussians).means, np.flatnonzero(is_candidate).tolist()
+    means = frame.leave(decoded.gaussians).means
+    candidates = np.flatnonzero(is_candidate).tolist()
     keep = np.isin(owning_views(means, covisibility, candidates), block.own)
     before = measure_input(prepared, plan.score)
     return BlockStart(

@@ -51,9 +51,13 @@ def curve_counts(max_drop: float | None, usual: int, least: int, most: int) -> t
     The counts lie around the ``usual`` count, between ``least`` and ``most``. ``max_drop`` is the largest loss of
     quality (dB) that is allowed on the curve; None: the knee of the curve decides the number.
     """
-    shares, steps = [1 / 8, 1 / 4, 1 / 2, 1.0], 60  # shares of the usual count; this is enough to find the knee
+    # shares of the usual count; this is enough to find the knee
+    shares = [1 / 8, 1 / 4, 1 / 2, 1.0]
+    steps = 60
     if max_drop is not None:
-        shares, steps = [1 / 16, *shares, 2.0], 300  # a loss may be a tenth of a dB, which shorter fits do not show
+        # a loss may be a tenth of a dB, which shorter fits do not show
+        shares = [1 / 16, *shares, 2.0]
+        steps = 300
     return sorted({min(max(round(usual * share), least), most) for share in shares}), steps
 
 
@@ -72,11 +76,15 @@ def measure_curve(
     )  # fmt: skip
     if left_out is None:
         photos = scene_photos(prepared.scene)[prepared.reference.score_views]
-        weights, min_gain = training_weights(photos, holdout, plan.seed), short.tuning.min_gain
+        weights = training_weights(photos, holdout, plan.seed)
+        min_gain = short.tuning.min_gain
     else:
         seen = np.flatnonzero(left_out.shares > LEAST_SEEN).tolist()
-        photos, weights = left_out.photos[seen], [1 - mask.astype(np.float32) for mask in left_out.seen[seen]]
-        prepared, plan, min_gain = left_out.rest, left_out.plan(plan), math.inf
+        photos = left_out.photos[seen]
+        weights = [1 - mask.astype(np.float32) for mask in left_out.seen[seen]]
+        prepared = left_out.rest
+        plan = left_out.plan(plan)
+        min_gain = math.inf
     short_plan = plan.with_fit(short)
     short_plan = replace(short_plan, merge=replace(short_plan.merge, checkpoint=None))
     points: list[CurvePoint] = []

@@ -33,7 +33,8 @@ def meet_bytes(candidate: Candidate, prepared: Prepared, plan: Plan) -> Candidat
 
     def choose_next(built: Sequence[Candidate]) -> int | None:
         """Return the count whose file is expected to be as large as allowed; None if the last build is near enough."""
-        last, count = built[-1], len(built[-1].gaussians)
+        last = built[-1]
+        count = len(built[-1].gaussians)
         num_bytes = size.measure(last.gaussians, last.cameras, names)
         expected_count = int(BUILD_SURPLUS * count * (max_bytes - base_bytes) / max(num_bytes - base_bytes, 1))
         next_count = min(expected_count, plan.count.limits.most)
@@ -72,14 +73,18 @@ def drop_to_bytes(
     ``base_bytes`` are the bytes of a file with one Gaussian.
     """
     max_bytes = size.num_bytes
-    fitting_count, most_count = 0, len(gaussians)  # the largest count that is known to fit, and the largest that may
-    fitting, count = gaussians[:0], len(gaussians)
+    # the largest count that is known to fit, and the largest that may
+    fitting_count = 0
+    most_count = len(gaussians)
+    fitting = gaussians[:0]
+    count = len(gaussians)
     full_share = 0.985  # a file with this share of ``max_bytes`` is full enough
     for _ in range(MOST_MEASURED):
         kept = gaussians if count == len(gaussians) else faintest_dropped(gaussians, count)
         num_bytes = size.measure(kept, cameras, names)
         if num_bytes <= max_bytes:
-            fitting_count, fitting = count, kept
+            fitting_count = count
+            fitting = kept
         else:
             most_count = count - 1
         if fitting_count >= most_count or (fitting_count and full_share * max_bytes <= num_bytes <= max_bytes):

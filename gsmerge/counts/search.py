@@ -37,7 +37,9 @@ from gsmerge.settings.stages import CleanOptions
 # The slope is the gain of PSNR (dB) per doubling of the count. Until two counts were built, a search assumes these
 # slopes, against photos and against renders of the input. Photos that were left out gained LEFT_OUT_SLOPE below the
 # usual count, in the mean of eleven captures
-PHOTOS_SLOPE, RENDERS_SLOPE, LEFT_OUT_SLOPE = 1.0, 3.0, 0.3
+PHOTOS_SLOPE = 1.0
+RENDERS_SLOPE = 3.0
+LEFT_OUT_SLOPE = 0.3
 SAME_COUNT_RATIO = 1.15  # two counts are the same up to this ratio
 # A search against renders ends at a count whose PSNR is at most this many dB above the target. With RENDERS_SLOPE, a
 # count at which the search ends is at most SAME_COUNT_RATIO times the least count that reaches the target
@@ -98,7 +100,8 @@ def _reach_target(prepared: Prepared, plan: Plan) -> Candidate:
         add_seconds(candidate.record.seconds)
         return candidate.deciding_psnr or 0.0
 
-    limits, most = plan.count.limits, most_useful(prepared, plan, left_out)
+    limits = plan.count.limits
+    most = most_useful(prepared, plan, left_out)
     first = min(max(limits.default, limits.min_count), most)
     search = CountSearch(plan.count, first, prepared.reference.name == RENDERS, left_out, most)
     search.run(measure)
@@ -122,14 +125,16 @@ def _reach_target(prepared: Prepared, plan: Plan) -> Candidate:
 
 def build_levels(best: Candidate, prepared: Prepared, plan: Plan) -> list[Candidate]:
     """Build the coarser levels of detail of a result, which keep the cameras that the result has."""
-    prepared, plan = prepared.with_cameras(best.fitted.cameras), plan.with_fixed_cameras()
+    prepared = prepared.with_cameras(best.fitted.cameras)
+    plan = plan.with_fixed_cameras()
     counts = level_counts(len(best.gaussians), plan.count.levels, plan.count.limits.min_count)
     return [build_candidate(prepared, plan, count) for count in counts]
 
 
 def most_useful(prepared: Prepared, plan: Plan, left_out: LeftOut | None) -> int:
     """Return the largest count of a search, above which left-out photos gain nothing."""
-    limits, agreement = plan.count.limits, prepared.agreement
+    limits = plan.count.limits
+    agreement = prepared.agreement
     if left_out is None or agreement is None:
         return limits.max_count
     return max(limits.min_count, min(limits.max_count, int(agreement.share * limits.num_pixels)))
@@ -154,8 +159,10 @@ class CountSearch:
 
     def run(self, measure: Callable[[int], float]) -> None:
         """Measure the PSNR (dB) of each count that the search chooses."""
-        plan, limits = self.plan, self.plan.limits
-        least, most = limits.min_count, limits.max_count
+        plan = self.plan
+        limits = self.plan.limits
+        least = limits.min_count
+        most = limits.max_count
         if plan.keeps_fidelity and not plan.auto_count:
             least = min(limits.default, limits.max_count)
         if not (plan.keeps_fidelity or self.rendered):
@@ -166,12 +173,16 @@ class CountSearch:
         # The slope (dB per doubling of the count) is assumed at first. The search ends at a PSNR that is at most
         # ``near`` dB above the target
         if self.left_out is not None:
-            slope, near = LEFT_OUT_SLOPE, LEFT_OUT_SLOPE / 2
+            slope = LEFT_OUT_SLOPE
+            near = LEFT_OUT_SLOPE / 2
         elif self.rendered:
-            slope, near = RENDERS_SLOPE, NEAR_DB
+            slope = RENDERS_SLOPE
+            near = NEAR_DB
         else:
-            slope, near = PHOTOS_SLOPE, PHOTOS_NEAR_DB if plan.keeps_fidelity else 0.0
-        count, most_builds = self.first, MAX_BUILDS if self.left_out is None else MAX_LEFT_OUT_BUILDS
+            slope = PHOTOS_SLOPE
+            near = PHOTOS_NEAR_DB if plan.keeps_fidelity else 0.0
+        count = self.first
+        most_builds = MAX_BUILDS if self.left_out is None else MAX_LEFT_OUT_BUILDS
         while count not in self.psnrs and len(self.psnrs) < most_builds:
             self.psnrs[count] = measure(count)
             count = next_count(self.psnrs, self.target, least, most, slope, near)
@@ -226,7 +237,8 @@ class CountSearch:
 
     def notes(self, num_gaussians: int) -> list[str]:
         """Return a note if keeping the quality of the input takes more Gaussians than usual, or what photos gain."""
-        count, limits = self.best, self.plan.limits
+        count = self.best
+        limits = self.plan.limits
         if not self.plan.keeps_fidelity or count <= limits.default:
             is_told = self.left_out is not None and self.is_met
             return [f"quality: {self._describe_reached(num_gaussians)}"] if is_told else []
@@ -294,7 +306,9 @@ def choose_count(prepared: Prepared, plan: Plan) -> int | None:
 
     The curve is measured on left-out photos or, without them, on patches of all photos.
     """
-    limits, drop, left_out = plan.count.limits, plan.count.max_drop, leave_out_for_scores(prepared, plan)
+    limits = plan.count.limits
+    drop = plan.count.max_drop
+    left_out = leave_out_for_scores(prepared, plan)
     if drop is None and not plan.count.auto_count:
         return limits.count
     if prepared.reference.name == RENDERS:
