@@ -57,7 +57,9 @@ class SceneError(GsmergeError):
         # Messages of libraries may have several lines. Views without names are called "view 0" and so on, so "view
         # NAME" in a message has the word "view" twice
         problem = " ".join(problem.split()).replace("view view ", "view ")
-        self.path, self.problem, self.remedy = str(path), problem, remedy
+        self.path = str(path)
+        self.problem = problem
+        self.remedy = remedy
         # what was tried before a scene was refused, see :class:`gsmerge.reading.choice.Choice`
         self.candidates: tuple[Any, ...] = ()
         super().__init__(f"{self.path}: {problem}" + (f"; {remedy}" if remedy else ""))

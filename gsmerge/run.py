@@ -126,7 +126,8 @@ def compact_files(
     """
     start = perf_counter()
     settings = settings_for(outputs, settings)
-    out, format_ = outputs.result, outputs.format
+    out = outputs.result
+    format_ = outputs.format
     with atomic_outputs(overwrite=outputs.overwrite) as add:
         temporary = add(out)  # before the long work, so that an output that cannot be written ends the run at once
         load = read_input(files, opacity=opacity, hints=hints, hashed=hashed)
@@ -167,7 +168,8 @@ def compact_scene(scene: Scene, options: CompactOptions) -> CompactResult:
 
     Nothing is checked, and doubts are in the report instead of Python warnings.
     """
-    whole, budget = scene, options.budget
+    whole = scene
+    budget = options.budget
     if options.clean.crop is not None:
         scene = crop_scene(scene.numpy(), options.clean.crop)
     size = measure_size(scene)
@@ -244,7 +246,8 @@ def compact_simpler(scene: Scene, options: CompactOptions, result: CompactResult
             result = compact_prepared(*plan_run(scene, simpler))
         if not result.report.is_far:
             return result
-    problem, budget = f"expected a result as good as its input, found none: {cause}", max(1, len(result.gaussians))
+    problem = f"expected a result as good as its input, found none: {cause}"
+    budget = max(1, len(result.gaussians))
     raise TargetError(
         f"{problem}; gsmerge inspect says how it is read, and --budget {budget} writes a result all the same"
     )

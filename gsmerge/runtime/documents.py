@@ -87,7 +87,8 @@ def text_table(
     the third.
     """
     max_width = 10_000  # width of a table that is not printed on a terminal
-    widths, room = [max(map(len, column)) for column in zip(*rows, strict=True)], (letters or max_width) - len(indent)
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    room = (letters or max_width) - len(indent)
     shown = list(range(len(widths)))
     for column in (*omitted_first, *reversed(shown[2:])):
         name_width = widths[0] if column in omitted_first else min(widths[0], MIN_NAME)

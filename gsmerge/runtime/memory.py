@@ -25,7 +25,8 @@ BYTES_PER_VALUE = 4.5  # for each value of higher harmonics, in the scene and in
 BYTES_PER_PIXEL = 90  # for the photo as floats, and arrays of segmentation and rendering
 # Bytes that a conversion to .sog or .glb needs for each Gaussian, and for each value of higher harmonics. A conversion
 # to .ply needs a third of these bytes
-BYTES_CONVERTED, BYTES_CONVERTED_VALUE = 330, 6
+BYTES_CONVERTED = 330
+BYTES_CONVERTED_VALUE = 6
 BYTES_ELSEWHERE = 40  # for each Gaussian outside of the block that is in memory
 FEWER_PIXELS = (
     "use fewer views (gsmerge extend adds more later), export without higher harmonics, or try --effort draft"

@@ -13,7 +13,9 @@ from gsmerge.frozen import dataclass
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
-COMMANDS, METHODS = "gsmerge.commands", "gsmerge.methods"  # groups of the entry points of plugins
+# groups of the entry points of plugins
+COMMANDS = "gsmerge.commands"
+METHODS = "gsmerge.methods"
 
 
 @dataclass(frozen=True)

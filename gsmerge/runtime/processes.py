@@ -15,7 +15,8 @@ from gsmerge.runtime.memory import memory_problem
 from gsmerge.runtime.work import Call, LostProcess, WorkerPool
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-LOST, FEWER = "its process was killed or ended unexpectedly", "perhaps out of memory, try fewer --jobs"
+LOST = "its process was killed or ended unexpectedly"
+FEWER = "perhaps out of memory, try fewer --jobs"
 
 
 class ProcessPool(WorkerPool):
@@ -26,7 +27,9 @@ class ProcessPool(WorkerPool):
     """
 
     def __init__(self, jobs: int, threads: int, memory: float) -> None:
-        self.capacity, self.threads, self.memory = jobs, threads, memory
+        self.capacity = jobs
+        self.threads = threads
+        self.memory = memory
         self.idle: list[ProcessPoolExecutor] = []
         self.calls: dict[Future[Any], tuple[Call, ProcessPoolExecutor]] = {}  # running calls, each with its executor
 

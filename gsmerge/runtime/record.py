@@ -55,7 +55,9 @@ class Forecast:
         if self.part is not None:
             self.done += self.part.work
         names = [part.name for part in self.parts]
-        self.part, self.done_of_part = RunPart(name, 0.0), 0.0  # of more parts than were expected
+        # of more parts than were expected
+        self.part = RunPart(name, 0.0)
+        self.done_of_part = 0.0
         if name in names:
             self.part = self.parts[names.index(name)]
             del self.parts[: names.index(name) + 1]

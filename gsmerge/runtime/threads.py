@@ -140,7 +140,8 @@ def use_threads(count: int | None = None) -> Iterator[int]:
         yield count
     finally:
         _local.pool.shutdown()
-        _local.pool, _local.count = None, 1
+        _local.pool = None
+        _local.count = 1
         with _libraries.lock:  # torch is as before if this pool limited it, and OpenCV after the last pool
             _libraries.pools -= 1
             if _local.holds_torch:

@@ -51,11 +51,15 @@ class WorkerPool(ABC):
         Yields the key and the result of each call as soon as the call ends. The result of a call whose process died is
         a :class:`LostProcess`. Raises the exception of a failed call.
         """
-        waiting, num_running, call = iter(calls), 0, None  # `call` is the next call, if it still waits for memory
+        # `call` is the next call, if it still waits for memory
+        waiting = iter(calls)
+        num_running = 0
+        call = None
         while True:
             while num_running < self.capacity and (call := call or next(waiting, None)) and self.has_room(call):
                 self.submit(function, call)
-                num_running, call = num_running + 1, None
+                num_running = num_running + 1
+                call = None
             if not num_running:
                 return
             ended = self.wait()
@@ -203,7 +207,8 @@ class RayPool(WorkerPool):
 
     def __init__(self, cluster: Cluster, threads: int, *, jobs: int = 0) -> None:
         self.cluster, self.ray = cluster, cluster.ray
-        self.threads, self.jobs = threads, jobs
+        self.threads = threads
+        self.jobs = jobs
         calls_per_process = 200  # then a process is replaced, so that memory leaks of libraries cannot add up
         self.function = self.ray.remote(max_retries=RETRIES, max_calls=calls_per_process)(_call_in_folder)
         self.keys: dict[Any, Any] = {}  # key of each running call, by the reference to its result

@@ -149,7 +149,8 @@ class CompactOptions(Settings):
 
         Some of these settings are possible for views that arrive in batches, see :attr:`compact_only`.
         """
-        values, excluded = self.to_dict(), {"poses": "free", "exposure": "per-photo", "budget": AUTO}
+        values = self.to_dict()
+        excluded = {"poses": "free", "exposure": "per-photo", "budget": AUTO}
         return [*self.whole_only, *(f"{name} {value}" for name, value in excluded.items() if values[name] == value)]
 
     @property
@@ -159,7 +160,8 @@ class CompactOptions(Settings):
 
     def changed(self, names: Iterable[str]) -> list[str]:
         """Return those ``names`` of settings whose values differ from the defaults; all names are flat."""
-        values, declared = self.to_dict(), flat_settings(CompactOptions)
+        values = self.to_dict()
+        declared = flat_settings(CompactOptions)
         return [name for name in names if values[name] != declared[name].default]
 
     def to_dict(self) -> dict[str, Any]:

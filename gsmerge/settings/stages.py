@@ -20,7 +20,9 @@ KRule = Literal["saliency", "distortion"]
 SEGMENTATIONS = ("rdseg", "bass", "bass-st", "slic", "grid")
 SHARE = "4.4%"  # default number of superpixels per pixel
 MAX_CHILDREN = 8  # most Gaussians that a superpixel may become
-MIXED, MIXED_COUNTS = "mixed", (1, 2, 4)  # with this option, K is one of these numbers for each group
+# with this option, K is one of these numbers for each group
+MIXED = "mixed"
+MIXED_COUNTS = (1, 2, 4)
 USUAL_K = 1  # the K of the option "auto", except for a single camera without a long fit
 MATCH_NEIGHBORS = {"overlap": 16, "aabb": 1}  # default numbers to compare, see docs/internals/decisions.md#merging
 CROP = "sphere:x,y,z,radius or box:x0,y0,z0,x1,y1,z1, optionally with three angles in degrees"
