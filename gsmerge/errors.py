@@ -95,9 +95,9 @@ def count_words(number: int, noun: str, rest: str = "") -> str:
         >>> count_words(1, "row"), count_words(1200, "row", "set aside")
         ('1 row', '1,200 rows set aside')
     """
-    return f"{number:,} {noun}{'' if number == 1 else 'es' if noun.endswith('ch') else 's'}" + (
-        f" {rest}" if rest else ""
-    )
+    if number != 1:
+        noun += "es" if noun.endswith("ch") else "s"
+    return f"{number:,} {noun} {rest}".rstrip()
 
 
 class Note(str):

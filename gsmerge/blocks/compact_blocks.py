@@ -136,7 +136,7 @@ def compact_blocks(
         fitted = list(adopt_records(work.run("fit", fit_block, count, list_calls(starts, shared_start, growth))))
         joined, owners = join_parts([gaussians for gaussians, _ in fitted])
         joined = fit_seams(joined, owners, starts, options.seed)
-        result = finish_joined(joined, scene.cameras, scene.names, frame, options, plan)
+        result = finish_joined(joined, scene.cameras, names=scene.names, frame=frame, options=options, plan=plan)
         scored = work.run("score", score_block, count, list_calls(starts, work.share(result)))
         scores = [score for score, _ in adopt_records(scored)]
     facts = [

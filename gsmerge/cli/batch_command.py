@@ -79,8 +79,8 @@ def batch(
     settings, ray = given.make(*SETTINGS)
     try:
         options = BatchOptions(
-            settings, *reading, cameras, images, masks, protect, name, None if jobs == AUTO else jobs, overwrite,
-            ray.engine, ray.address,
+            settings, *reading, cameras=cameras, images=images, masks=masks, protect=protect, output=name,
+            jobs=None if jobs == AUTO else jobs, overwrite=overwrite, engine=ray.engine, address=ray.address,
         )  # fmt: skip
     except ValueError as error:
         raise UsageError(str(error).replace("output:", "--name:", 1)) from error
@@ -127,7 +127,17 @@ def _run(
                 share = 1.0 if num_ended == len(jobs) else (num_ended - num_skipped) / (len(jobs) - num_skipped)
                 report = record["report"]  # None for a failure, and for a result that was done before
                 record_notes = [Doubt(text) for text in record["doubts"]] if report is None else report["notes"]
-                progress(RunEnd(record["scene"], record["status"], num_ended, failure, num_failed, share, record_notes))
+                progress(
+                    RunEnd(
+                        record["scene"],
+                        status=record["status"],
+                        done=num_ended,
+                        failure=failure,
+                        num_failed=num_failed,
+                        share=share,
+                        notes=record_notes,
+                    )
+                )
     finally:
         if not silent:
             print_document(

@@ -93,7 +93,10 @@ def read_before_after(
     for name, ply in plys.items():  # files of different marks are each drawn their own way
         if ply.info.antialiased != scene.cameras.antialiased:
             cameras[name] = replace(cameras.get(name, scene.cameras), antialiased=ply.info.antialiased)
-    return BeforeAfter(load, scene, held_out, plys, cameras, [*load.notes, *target_notes, *notes, *camera_notes])
+    return BeforeAfter(
+        load, scene=scene, held_out=held_out, plys=plys, cameras=cameras,
+        notes=[*load.notes, *target_notes, *notes, *camera_notes],
+    )  # fmt: skip
 
 
 def own_cameras(paths: Sequence[Path], scene: Scene) -> tuple[dict[str, Cameras], list[str]]:

@@ -93,22 +93,22 @@ def compact(
     source = features or _find_files(scenes, output, cameras, images=images, masks=masks, protect=protect)
     ply = source if isinstance(source, Path) else source.base
     out = output_file(output or ply.parent, f"{ply.stem}.compact.ply")
-    run = Run(scenes[0], out, start, overwrite, dry_run, strict, json, verbose, quiet, has_page=open is not None)
+    run = Run(
+        scenes[0], out=out, start=start, overwrite=overwrite, dry_run=dry_run, strict=strict, json=json,
+        verbose=verbose, quiet=quiet, has_page=open is not None,
+    )  # fmt: skip
     # A page cannot show joined scenes or Feature Gaussians, so only the result is shown
     on_page = [scenes[0], out] if features is None and len(scenes) == 1 else [out]
     if run.has_page and os.path.exists(out) and not (overwrite or dry_run):
         view_command = shlex.join(["gsmerge", "view", *map(str, on_page)])
         raise UsageError(f"{out}: exists already; {view_command} shows it, --overwrite makes it again")
-    loaded = None
-    changes: list[str] = []
+    loaded, changes = None, list[str]()
     if isinstance(source, Path):
         _decode_features(context, source, given, run)
     else:
-        has_levels = "levels" in given.values
+        how = opt.read_hints(hint), run
         try:
-            loaded, changes = _compact_files(
-                source, settings, writing, opt.read_hints(hint), run, has_levels=has_levels
-            )
+            loaded, changes = _compact_files(source, settings, writing, *how, has_levels="levels" in given.values)
         except SceneError as error:
             _print_candidates(error.candidates, run)
             raise

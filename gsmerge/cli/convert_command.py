@@ -59,7 +59,8 @@ def convert(
     reading = opt.read_hints(hint)
     hints = reading.hints
     options = ConvertOptions(
-        inputs, outputs, cameras, images, reading.opacity, hints.scales, hints.colors, cleaning, placement,
+        inputs, outputs, cameras=cameras, images=images, opacity=reading.opacity, scales=hints.scales,
+        colors=hints.colors, clean=cleaning, placement=placement,
     )  # fmt: skip
     with stage_progress(quiet=quiet or json) as on_step, record_run(on_step):
         document = convert_files(options)

@@ -89,9 +89,11 @@ def render(
         check_folder(output, inputs, overwrite=overwrite)
     reading = opt.read_hints(hint, **({"max_side": MAX_SIDE} if kind == "views" else {}))
     level = None if background == NONE or (background is None and kind == "panel") else background or 0.0
-    drawing = drawings.DRAWINGS[kind](
-        drawings.DrawOptions(files, scenes, framing, output, *reading, views, path, frames, size, level)
-    )
+    options = drawings.DrawOptions(
+        files, scenes, framing, output, views=views, path=path, frames=frames, size=size, background=level,
+        opacity=reading.opacity, hints=reading.hints,
+    )  # fmt: skip
+    drawing = drawings.DRAWINGS[kind](options)
     document = {**document_head(), "output": str(output), "pictures": [str(picture) for picture in drawing.paths]}
     document |= drawing.facts | note_entries(drawing.facts["notes"])
     say_notes(document["notes"], quiet=quiet or json)

@@ -185,7 +185,7 @@ class CountSearch:
         most_builds = MAX_BUILDS if self.left_out is None else MAX_LEFT_OUT_BUILDS
         while count not in self.psnrs and len(self.psnrs) < most_builds:
             self.psnrs[count] = measure(count)
-            count = next_count(self.psnrs, self.target, least, most, slope, near)
+            count = next_count(self.psnrs, self.target, least=least, most=most, slope=slope, near=near)
 
     @property
     def best(self) -> int:

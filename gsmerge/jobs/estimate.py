@@ -147,7 +147,9 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
     coarser = level_counts(num_drawn, budget.levels, limits.min_count)
     seconds = costs.seconds(num_drawn, coarser, len(scene), options.threads or available_threads())
     memory = memory_bytes(at_once, num_rest=num_rest, num_elsewhere=num_pixels - at_once)
-    is_distributed = limits.count is not None or budget.auto
+    per_view = None if limits.count is not None or budget.auto else limits.per_view
+    if plan.pipeline == BARE_ROWS:
+        per_view = 0
     return {
         "num_gaussians": count,
         "exact": options.budget.is_filled or found_count is not None,
@@ -158,7 +160,7 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
         "bytes": file_bytes(count, scene.gaussians.sh_degree),
         "blocks": num_blocks,
         "method": options.method,
-        "superpixels_per_view": 0 if plan.pipeline == BARE_ROWS else None if is_distributed else limits.per_view,
+        "superpixels_per_view": per_view,
         **{name: settings[name] for name in ("k", "match", "checkpoint")},
         "fit": fit,
         "fit_steps": plan.fit.steps,

@@ -133,7 +133,7 @@ def compact_tensors(
     photos = None
     if order != "none" or viewmats is not None or images is not None:
         cameras, photos = _check_cameras_and_images(viewmats, Ks, images, shape)
-    scene, scene_notes = _combine(gaussians, valid, cameras, photos, names, order)
+    scene, scene_notes = _combine(gaussians, valid, cameras=cameras, images=photos, names=names, order=order)
     rotations = scene.gaussians.quats
     # Quaternions that are computed from matrices rarely have a negative w. The note may be wrong for Depth Anything 3,
     # where the last column is z and is never negative

@@ -21,7 +21,9 @@ LEVEL_SHARE = 0.6
 
 def usual_builds(*, has_target: bool, rendered: bool) -> int:
     """Return how many results a run usually builds; ``rendered``: renders of the input stand for photos."""
-    return (USUAL_BUILDS_OF_RENDERS if rendered else USUAL_BUILDS) if has_target else 1
+    if not has_target:
+        return 1
+    return USUAL_BUILDS_OF_RENDERS if rendered else USUAL_BUILDS
 
 
 def run_parts(prepared: Prepared, plan: Plan) -> list[RunPart]:

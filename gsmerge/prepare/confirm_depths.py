@@ -52,8 +52,8 @@ def confirm_depths(scene: Scene) -> Agreement | None:
     confirmed, contradicted, alone = counts[:, 0, 1:].sum(0) / num_pixels
     contradicted_part, alone_part = (_worst_part(counts[:, 1:, kind], counts[:, 1:, 0]) for kind in (2, 3))
     return Agreement(
-        float(confirmed), float(contradicted), float(alone), num_pixels, contradicted_part, alone_part,
-        from_one_point=bool(from_one_point),
+        float(confirmed), contradicted=float(contradicted), alone=float(alone), num_pixels=num_pixels,
+        contradicted_part=contradicted_part, alone_part=alone_part, from_one_point=bool(from_one_point),
     )  # fmt: skip
 
 

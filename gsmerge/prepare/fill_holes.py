@@ -263,4 +263,6 @@ def _fill_view(scene: PicturedScene, view: int, holes: np.ndarray, edges: _Edges
         farthest = edges.farthest * FACTORS[-1]
         best_depths = np.where(np.isfinite(edges.known), np.minimum(edges.known, farthest), best_depths)
     size = NEW_SIZE_PIXELS / cameras.Ks[view, 0, 0]
-    return make_round_gaussians(eye, rays, best_depths, size, colors, scene.gaussians.shN.shape[1])
+    return make_round_gaussians(
+        eye, rays, depths=best_depths, size=size, colors=colors, num_higher=scene.gaussians.shN.shape[1]
+    )

@@ -273,9 +273,11 @@ def _gather_evidence(level: _PhotoLevel, viewmats: np.ndarray) -> _Evidence:
         scratch = np.empty((SCRATCH_COLUMNS, max_points))
         scratch_ids = np.empty(max_points, np.int64)
         compare_views(
-            level.points, level.greys, level.starts, level.pairs, viewmats, level.first_viewmats, level.Ks,
-            level.pictures, level.depths, NEAR_PLANE, BORDER, level.scale, begin, min(begin + TOGETHER, count),
-            scratch, scratch_ids, evidence.curvatures, evidence.slopes, evidence.costs, evidence.flows,
+            level.points, level.greys, starts=level.starts, pairs=level.pairs, viewmats=viewmats,
+            given=level.first_viewmats, Ks=level.Ks, pictures=level.pictures, depths=level.depths, near=NEAR_PLANE,
+            border=BORDER, scale=level.scale, first=begin, last=min(begin + TOGETHER, count), scratch=scratch,
+            order=scratch_ids, curvatures=evidence.curvatures, slopes=evidence.slopes, costs=evidence.costs,
+            flows=evidence.flows,
         )  # fmt: skip
 
     parallel_map(compare_pairs, range(0, count, TOGETHER))

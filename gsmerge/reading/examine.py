@@ -51,7 +51,7 @@ def examine(ply: GaussianFile, views: Views, hints: ReadHints) -> Evidence:
     if photos.by_names:
         files = replace(files, images=photos.folder)
     if camera_file is None:
-        return _measure(start, ply, files, hints, None, NO_PHOTOS)
+        return _measure(start, ply, files=files, hints=hints, cameras=None, photos=NO_PHOTOS)
     measure = partial(_measure, start, ply, files, hints)
     if views.photo_error is None and not photos.named:  # there are no photos, or they are in one file
         alone = measure(camera_file, photos)

@@ -90,17 +90,19 @@ _EXPORTERS = (
         "da3",
         (
             Model(
-                "Depth Anything 3", "ByteDance-Seed/Depth-Anything-3 2c21ea8; `utils/export/gs.py` 831637d",
-                "`gs_ply/0000.ply` without borders and the farthest tenth of each view; cameras of the nested model in"
-                " another unit, in `exports/*/results.npz` or COLMAP's files where they are asked for",
-                'read right with `export_format="npz-gs_ply"`, `"mini_npz-gs_ply"` or `"colmap-gs_ply"`, and alone',
-                "0000.ply", 'export_format="npz-gs_ply" writes its cameras beside the file',
+                "Depth Anything 3", source="ByteDance-Seed/Depth-Anything-3 2c21ea8; `utils/export/gs.py` 831637d",
+                output="`gs_ply/0000.ply` without borders and the farthest tenth of each view; cameras of the nested"
+                " model in another unit, in `exports/*/results.npz` or COLMAP's files where they are asked for",
+                result='read right with `export_format="npz-gs_ply"`, `"mini_npz-gs_ply"` or `"colmap-gs_ply"`, and'
+                " alone",
+                place="0000.ply", camera_advice='export_format="npz-gs_ply" writes its cameras beside the file',
             ),
             Model(
-                "Lyra 2", "nv-tlabs/lyra 67392d9",
-                "`reconstructed_scene.ply` of half the size, without borders; `cameras.npz`",
-                f"{_NO_PIXELS}, with its frames",
-                "reconstructed_scene.ply", "its cameras.npz has the cameras: keep it beside the file",
+                "Lyra 2", source="nv-tlabs/lyra 67392d9",
+                output="`reconstructed_scene.ply` of half the size, without borders; `cameras.npz`",
+                result=f"{_NO_PIXELS}, with its frames",
+                place="reconstructed_scene.ply",
+                camera_advice="its cameras.npz has the cameras: keep it beside the file",
             ),
         ),
         "logit", "view-major",
@@ -371,8 +373,10 @@ _EXPORTERS = (
         "gsplat",
         (
             Model(
-                "gsplat", "nerfstudio-project/gsplat 90d7b4b", "`ply/point_cloud_STEP.ply`; no cameras", _WITH_CAMERAS,
-                "ply/point_cloud_*.ply", "the COLMAP model that it was trained on has the cameras: name it with"
+                "gsplat", source="nerfstudio-project/gsplat 90d7b4b", output="`ply/point_cloud_STEP.ply`; no cameras",
+                result=_WITH_CAMERAS,
+                place="ply/point_cloud_*.ply",
+                camera_advice="the COLMAP model that it was trained on has the cameras: name it with"
                 " --cameras",
             ),
         ),

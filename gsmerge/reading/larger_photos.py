@@ -86,7 +86,9 @@ def read_larger_and_masks(
         to_file[:2, 2] = corner / scale - start
         Ks_of_file = matmul(to_file, cameras.Ks)
         large = LargePhotos(Ks_of_file, right - left, bottom - top, tuple(range(len(cameras))), read)
-    return large, *read_masks(files, camera_file, photos, stored, cut, cameras, is_plain)
+    return large, *read_masks(
+        files, camera_file, photos=photos, stored=stored, cut=cut, cameras=cameras, is_plain=is_plain
+    )
 
 
 def limit_photo_size(

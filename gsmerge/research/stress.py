@@ -204,7 +204,7 @@ def stress(
         passed, measured = _check_case(case, setup, base, options)
         seconds = time.perf_counter() - start
         expected = PROPERTIES[case.check].format(**limits)
-        out.append(StressOutcome(name, case.words, expected, passed, measured, seconds))
+        out.append(StressOutcome(name, words=case.words, wanted=expected, held=passed, found=measured, seconds=seconds))
     report("done", len(names), len(names))
     return tuple(out)
 

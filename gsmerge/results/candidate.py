@@ -43,7 +43,10 @@ def score(fitted: Fitted, prepared: Prepared, plan: Plan, count: int | None = No
         record_choices(poses=moves)
         note(f"{cause}: cameras were moved by {describe_moves(moves)}")
     psnr, deciding_psnr = _measure_candidate(gaussians, moved, plan.score)
-    return Candidate(count, fitted, gaussians, cameras, psnr, current_record(), deciding_psnr)
+    return Candidate(
+        count, fitted=fitted, gaussians=gaussians, cameras=cameras, psnr=psnr, record=current_record(),
+        deciding_psnr=deciding_psnr,
+    )  # fmt: skip
 
 
 def rescore(candidate: Candidate, gaussians: Gaussians, prepared: Prepared, plan: Plan) -> Candidate:

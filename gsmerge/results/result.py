@@ -167,12 +167,20 @@ def make_result(best: Candidate, levels: Sequence[Candidate], prepared: Prepared
     seconds = dict(best.record.seconds)
     if "input" in seconds:
         seconds["input"] = seconds.pop("input")  # moved to the end, since the input is scored last
-    report = _report(best, prepared, plan, before, part_scores[0], seconds, 0)
+    report = _report(best, prepared, plan=plan, before=before, parts=part_scores[0], seconds=seconds, level=0)
     report = replace(report, unmet=best.unmet)
     coarser = tuple(
         CompactResult(
             candidate.gaussians,
-            _report(candidate, prepared, plan, before, part_scores[level], candidate.record.seconds, level),
+            _report(
+                candidate,
+                prepared,
+                plan=plan,
+                before=before,
+                parts=part_scores[level],
+                seconds=candidate.record.seconds,
+                level=level,
+            ),
             candidate.cameras,
         )
         for level, candidate in enumerate(levels, 1)
@@ -198,9 +206,9 @@ def _report(
     rendered = reference.name == RENDERS
     after = None if rendered else candidate.psnr
     report = CompactReport(
-        prepared.input_scene.num_gaussians, len(candidate.gaussians), dict(seconds), before, after, record.choices,
-        record.notes, plan.settings, peak_memory(), psnr_reference=None if before is None else reference.name,
-        **vars(parts),
+        prepared.input_scene.num_gaussians, num_output=len(candidate.gaussians), seconds=dict(seconds),
+        psnr_before=before, psnr_after=after, choices=record.choices, notes=record.notes, options=plan.settings,
+        peak_memory_bytes=peak_memory(), psnr_reference=None if before is None else reference.name, **vars(parts),
     )  # fmt: skip
     if prepared.doubt is not None:  # the photos do not fit the scene, so the report has no scores
         choices = {key: value for key, value in record.choices.items() if key != "fidelity"}

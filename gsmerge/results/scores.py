@@ -62,7 +62,10 @@ def measure_result(
         return None
     every = RESULT_EVERY if covered is None else INPUT_EVERY
     views = prepared.result_views()
-    return _score_photos("score", round_for_output(gaussians, plan), views, prepared, plan, covered, every)
+    return _score_photos(
+        "score", round_for_output(gaussians, plan), views=views, prepared=prepared, plan=plan, covered=covered,
+        every=every,
+    )  # fmt: skip
 
 
 def measure_input(prepared: Prepared, plan: ScorePlan) -> PhotoScore | None:
@@ -76,7 +79,7 @@ def measure_input(prepared: Prepared, plan: ScorePlan) -> PhotoScore | None:
     if prepared.scene.empty is not None:  # where a result may show nothing, the input is not scored either
         views = replace(views, masks=prepared.result_views().masks)
     covered = None if views.covered is None else list(views.covered[list(plan.views)])
-    return _score_photos("input", views.file_gaussians, views, prepared, plan, covered)
+    return _score_photos("input", views.file_gaussians, views=views, prepared=prepared, plan=plan, covered=covered)
 
 
 def _score_photos(
@@ -110,7 +113,9 @@ def _measure_on_files(gaussians: Gaussians, prepared: Prepared, plan: ScorePlan)
     views = prepared.result_views()
     if views.images is None or all(np.array_equal(views.images[view], photos[view]) for view in plan.views):
         return None
-    return _score_photos("score", gaussians, replace(views, images=photos), prepared, plan, None).psnr
+    return _score_photos(
+        "score", gaussians, views=replace(views, images=photos), prepared=prepared, plan=plan, covered=None
+    ).psnr
 
 
 def _measure_protected(gaussians: Gaussians, prepared: Prepared, plan: ScorePlan) -> PhotoScore | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from itertools import count
 
 import numpy as np
@@ -241,9 +242,8 @@ def evaluate(
     with use_threads(options.threads):
         renderer = _Renderer(near_plane(scene), options)
         progress("what the input views see", 0, 0)
-        splits = _make_splits(
-            scene, PHOTOS if scene.images is original.images else ROW_COLORS, inputs, targets, renderer
-        )
+        pictures = PHOTOS if scene.images is original.images else ROW_COLORS
+        splits = _make_splits(scene, pictures, inputs, targets, renderer)
         scored = {INPUT: inputs, **outputs} if options.own else outputs
         compared = scene.gaussians.numpy(), outputs, scene.cameras, renderer.near, progress, marks
         fog = measure_fog(*compared) if options.fog and outputs else {}
@@ -256,9 +256,9 @@ def evaluate(
             progress(f"evaluate: {name}", next(numbers), num_pictures)
 
         renderer.image(inputs[:1], scene.cameras, 0)  # loads the kernels, before times are measured
+        score = partial(_score_split, results=scored, marks=marks, renderer=renderer, on_image=report_image)
         split_scores = [
-            _score_split(kind, split, scored, cameras if kind == "context" else {}, marks, renderer, report_image)
-            for kind, split in splits.items()
+            score(kind, split, cameras=cameras if kind == "context" else {}) for kind, split in splits.items()
         ]
     scores = []
     for name, gaussians in scored.items():
@@ -266,10 +266,12 @@ def evaluate(
         seconds = float(np.median([seconds for seconds, _ in timed_views]))
         views = tuple(view for _, view in timed_views)
         ratio = len(gaussians) / max(len(inputs), 1)
-        scores.append(ResultScores(name, len(gaussians), ratio, seconds, views, fog.get(name, {}), marks[name]))
+        counted = name, len(gaussians), ratio
+        scores.append(ResultScores(*counted, seconds, scores=views, fog=fog.get(name, {}), antialiased=marks[name]))
     counts = {name: len(split.scored) for name, split in splits.items()}
     notes = (*lpips_notes, *_describe_scores(splits, scores, mended=mended))
-    return Evaluation(tuple(scores), _describe_references(splits), counts, notes, options, scene.images)
+    reference = _describe_references(splits)
+    return Evaluation(tuple(scores), reference, counts, notes=notes, options=options, pictures=scene.images)
 
 
 def _default_options() -> tuple[EvaluateOptions, Sequence[str]]:
@@ -396,7 +398,7 @@ def _score_split(
                 covered = (1 - alpha < COVERED_TRANSMITTANCE) & (split.masks is None or split.masks[view])
             score = ViewScore(kind, names[view], float(split.visible[view].mean()), Quality(), Quality())
             if view in split.scored:
-                score = _add_qualities(score, image, split, view, covered, nets)
+                score = _add_qualities(score, image, split, view, covered=covered, nets=nets)
             scores[name].append((seconds, score))
     return scores
 

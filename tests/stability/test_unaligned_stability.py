@@ -58,7 +58,7 @@ def test_rows_that_are_not_finite_cost_less_than_a_decibel(room: Scene) -> None:
     columns["sh0"][4::50] = -np.inf
     spoilt = Scene(Gaussians(**columns), room.cameras, room.images, None, room.names)
     result = compacted(spoilt)
-    assert noted(result.report.notes, "finite")
+    assert noted(result.report.choices["changes"], "finite")
     assert (
         abs(
             scenes.psnr_of(result.gaussians, room)

@@ -157,8 +157,9 @@ def collect_page_data(
     progress("the view from outside", 0, 0)
     with use_threads():
         data = _fill_page(
-            title, scene, results, file_bytes, held_out, evaluation, stills, light=light, cut_out=bool(cut_out)
-        )
+            title, scene, results=results, file_bytes=file_bytes, held_out=held_out, evaluation=evaluation,
+            stills=stills, light=light, cut_out=bool(cut_out),
+        )  # fmt: skip
     progress("done", 0, 0)
     gains = new_gains or {}
     sides = []
@@ -195,7 +196,9 @@ def _fill_page(
     scene_cameras = frame.enter_cameras(scene.cameras.numpy())
     split = "context" if held_out is None else "target"
     sides = [
-        _collect_side(result, size, split, canonical[result.name], scene, scene_cameras, light=light)
+        _collect_side(
+            result, size, split=split, gaussians=canonical[result.name], scene=scene, cameras=scene_cameras, light=light
+        )
         for result, size in zip(evaluation.results, file_bytes, strict=True)
     ]
     means = canonical[next(iter(results), INPUT)].means  # of the first result; without results, of the scene
@@ -229,8 +232,8 @@ def _fill_page(
     lacks_pixels = covered_share is not None and covered_share < WHOLE_SHARE
     agreement = confirm_depths(replace(scene, gaussians=frame.enter(scene.gaussians), cameras=scene_cameras))
     return ViewData(
-        title, tuple(sides), shown, outside, len(views), evaluation.reference, notes,
-        lacks_pixels, agreement, cut_out,
+        title, sides=tuple(sides), views=shown, outside=outside, num_views=len(views), reference=evaluation.reference,
+        notes=notes, lacks_pixels=lacks_pixels, agreement=agreement, cut_out=cut_out,
     )  # fmt: skip
 
 

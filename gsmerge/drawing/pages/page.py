@@ -120,7 +120,9 @@ def headline(data: ViewData, side_id: int = 1) -> str:
         return share_text
     if not np.isfinite(old):  # the input itself is the reference
         return f"{share_text}, {new:.1f} dB from the input's own renders"
-    target = "photos that were not used" if data.held_out else "its own photos" if reference == PHOTOS else reference
+    target = "its own photos" if reference == PHOTOS else reference
+    if data.held_out:
+        target = "photos that were not used"
     return f"{share_text}, {describe_gain(new - old)} {'to' if new >= old else 'from'} {target}"
 
 
@@ -196,7 +198,9 @@ def list_figures(data: ViewData, side_id: int) -> list[Figure]:
             new = getattr(new_quality, name)
             digits, unit = (2, " dB") if name == "psnr" else (3, "")
             is_better = side_id > 0 and old is not None and new is not None and old < new
-            mark = "own" if own else "up" if is_better else ""
+            mark = "up" if is_better else ""
+            if own:
+                mark = "own"
             scores.append(Figure(label, _format_number(old, digits), _format_number(new, digits) + unit, mark))
     if is_expected:
         gain = after.new_gain

@@ -100,7 +100,9 @@ def view(
     with record_run(progress):
         input_scene = as_scene(scene).numpy()
         shown_scene = add_views(input_scene, shown=True)  # viewpoints are placed for a scene without views
-    named = results if isinstance(results, Mapping) else {} if results is None else {"result": results}
+    named = results if isinstance(results, Mapping) else {"result": results}
+    if results is None:
+        named = {}
     files = {name: read_gaussians(path) for name, path in named.items() if isinstance(path, str | PathLike)}
     loaded: dict[str, Any] = {**named, **files}
     gaussians = {name: own_gaussians(result) for name, result in loaded.items()}

@@ -55,7 +55,9 @@ class CameraFormat:
         """Read the cameras of a file; raise SceneError if the file is damaged or incomplete."""
         stored = read_views(source, self.read) if isinstance(self.read, ViewLayout) else self.read(source)
         convention = stored.convention or self.convention
-        camera_file = make_camera_file(source.path, self.name, convention, stored.views, stored.images, stored.order)
+        camera_file = make_camera_file(
+            source.path, self.name, convention=convention, views=stored.views, images=stored.images, order=stored.order
+        )
         return replace(camera_file, counts=stored.counts, depths=stored.depths)
 
 

@@ -232,7 +232,7 @@ def read_views(source: CameraSource, layout: ViewLayout) -> StoredCameras:
             if has_intrinsics:
                 K, values = _intrinsics(path, name, layout, values, size_of)
             size = round(values.get("w", 0)), round(values.get("h", 0))
-            views.append(StoredView(name, pose, K, size, lens, values.get("mask", "")))
+            views.append(StoredView(name, pose=pose, K=K, size=size, lens=lens, mask=values.get("mask", "")))
     return StoredCameras(views if layout.finish is None else layout.finish(source, views))
 
 

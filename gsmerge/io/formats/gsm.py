@@ -176,7 +176,10 @@ def read_rows(path: Path) -> StoredRows:
         part = rows[block]
         least_scale = 1e-30  # scale that replaces 0, so that its logarithm is finite
         log_scales = log(np.maximum(part.scales, least_scale))
-        return Columns(part.means, part.quats, log_scales, part.opacities, part.sh0[:, 0], part.shN)
+        return Columns(
+            part.means, quats=part.quats, log_scales=log_scales, opacities=part.opacities, sh0=part.sh0[:, 0],
+            harmonics=part.shN,
+        )  # fmt: skip
 
     sizes = {name: as_array(column).nbytes for name, column in vars(rows).items()}
     comments, batches = (file.header["about"].get(name) for name in ("comments", "batches"))

@@ -318,7 +318,7 @@ def spz_columns(
     degree = min(max_degree, gaussians.sh_degree)
     # The fraction is chosen only if all means are finite, since other means raise an error later
     fraction = choose_fraction(means if np.isfinite(means).all() else means[:0], SCENE_BITS)
-    header = Header(version, count, degree, fraction, MIP_FLAG * mip, 0)
+    header = Header(version, count=count, degree=degree, fraction=fraction, flags=MIP_FLAG * mip, num_streams=0)
     parts = tuple(np.empty((count, width), np.uint8) for width in header.widths)
     for start, columns in arrays.column_blocks(gaussians, max_degree):
         for part, values in zip(parts, _quantise(columns, header), strict=True):

@@ -65,7 +65,10 @@ def write_apart(add: AddOutput, path: Path, temporary: Path, contents: Contents)
         degree = min(gaussians.sh_degree, format_.max_degree)
         normals = contents.options.normals
         # Additional columns belong to the rows of one level
-        _write_ply(file, gaussians, True, degree, contents.comments, normals, contents.extra_columns)
+        _write_ply(
+            file, gaussians, overwrite=True, sh_degree=degree, comments=contents.comments, normals=normals,
+            extra_columns=contents.extra_columns,
+        )  # fmt: skip
     return written
 
 
@@ -105,7 +108,7 @@ def write_gaussians(
     format_ = output_format(ending or path, alone=True)
     if format_.encode is None:
         degree = min(gaussians.sh_degree, format_.max_degree)
-        _write_ply(path, gaussians, overwrite, degree, comments, normals)
+        _write_ply(path, gaussians, overwrite=overwrite, sh_degree=degree, comments=comments, normals=normals)
         return
     check_readable(gaussians, comments)
     with atomic_output(path, overwrite=overwrite) as temporary:
@@ -148,7 +151,7 @@ def write_ply(
     """
     if fspath(path).lower().endswith(tuple(ending for ending in OUTPUT_FORMATS if ending != PLY.ending)):
         raise ValueError(f"path: expected a name that ends in .ply, got {fspath(path)}; call write_gaussians for it")
-    _write_ply(path, gaussians, overwrite, sh_degree, comments, normals)
+    _write_ply(path, gaussians, overwrite=overwrite, sh_degree=sh_degree, comments=comments, normals=normals)
 
 
 def _write_ply(

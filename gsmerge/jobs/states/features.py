@@ -177,7 +177,9 @@ def extend_features(
             if degree != expected:
                 raise UsageError(f"expected harmonics of degree {expected}, as in the state, got {degree}")
             saliency = group_saliency(features, members, pixel_saliency)
-            extended = _join_batch(state, features, saliency, context, samples, plan.merge.match)
+            extended = _join_batch(
+                state, features, saliency=saliency, context=context, samples=samples, options=plan.merge.match
+            )
     numbers = {"num_views": len(prepared_scene), "num_input": scene.num_gaussians, "num_new": len(features)}
     notes = [*record.notes, *([NOT_COMPARED] if state is not None and world == UNKNOWN_WORLD else [])]
     report = BatchReport(

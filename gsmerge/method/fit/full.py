@@ -50,7 +50,10 @@ def fit_full(
     """
     job = run.job
     survey = survey_photos(gaussians, run) if survey is None else survey
-    fit = FullFit(run, make_optimiser(run), Schedule(run), start_state(gaussians), survey.score, job.options.steps)
+    fit = FullFit(
+        run, optimiser=make_optimiser(run), schedule=Schedule(run), state=start_state(gaussians), before=survey.score,
+        steps=job.options.steps,
+    )  # fmt: skip
     fit.state.box_shares[:], fit.state.min_sizes[:] = limit_moves(survey, job.options.tuning)
     if fixed is not None:
         fit.state.fixed[:] = fixed

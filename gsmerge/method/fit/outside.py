@@ -187,7 +187,10 @@ def veil_gradients(splats: Splats, outside: Outside, view: int) -> Gradients:
     weights = np.where((losses > VEILED_LOSS) | np.isinf(limits), views.weights[view], 0) / np.float32(limits.size)
     image_gradient = np.zeros_like(image)
     image_gradient[..., 0] = -weights * inverse_limits
-    g = gradients_of(tiled, depths, image, transmittance, image_gradient, -weights, with_viewmat=False)
+    g = gradients_of(
+        tiled, depths, image=image, transmittance=transmittance, grad_image=image_gradient, grad_left=-weights,
+        with_viewmat=False,
+    )  # fmt: skip
     g.colors[:] = 0  # the colours drawn were depths, so the gradients mean nothing for colours
     min_gradient = 1e-9  # Gaussians with a smaller gradient are behind the limit, and should not gain opacity
     return g[np.flatnonzero(g.opacities > min_gradient)]

@@ -248,7 +248,7 @@ class Schedule:
         if mode.stride > 1:
             sample = Sample(mode.stride, *OFFSETS[self.samples[view] % len(OFFSETS)])
             self.samples[view] += 1
-        return Step(number, progress, mode, view, background, mask, sample)
+        return Step(number, progress=progress, mode=mode, view=view, background=background, mask=mask, sample=sample)
 
 
 def step_sizes(rates: Tuning, progress: float, steps: int) -> np.ndarray:

@@ -74,7 +74,9 @@ def survey_photos(gaussians: Gaussians, run: FitRun) -> Survey:
         pixels[ids] = np.minimum(pixels[ids], pixel_sizes)
         sums[ids] += weights
         squares[ids] += weights.astype(np.float64) ** 2
-    return Survey(score_images(images, run, half), inside, peaks, sums, squares, pixels)
+    return Survey(
+        score_images(images, run, half), inside=inside, peaks=peaks, sums=sums, squares=squares, pixels=pixels
+    )
 
 
 def choose_photos(gaussians: Gaussians, photos: Photos) -> list[int]:

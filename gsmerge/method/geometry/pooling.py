@@ -123,8 +123,9 @@ def pool_members(members: Members, starts: np.ndarray, ids: np.ndarray, rule: Ru
         """Pool some of the groups into the arrays ``pooled`` and ``sh``."""
         end = min(begin + ROWS_PER_TASK, num_groups)
         pool(
-            starts[begin : end + 1], ids, members.means, members.quats, members.scales, members.opacities,
-            members.sh0, members.shN, members.footprints, rule == "depth", pooled[begin:end], sh[begin:end],
+            starts[begin : end + 1], ids, means=members.means, quats=members.quats, scales=members.scales,
+            opacities=members.opacities, sh0=members.sh0, shN=members.shN, footprints=members.footprints,
+            own_covariance=rule == "depth", out_geometry=pooled[begin:end], out_sh=sh[begin:end],
         )  # fmt: skip
 
     parallel_map(pool_groups, range(0, num_groups, ROWS_PER_TASK))
@@ -135,8 +136,8 @@ def pool_members(members: Members, starts: np.ndarray, ids: np.ndarray, rule: Ru
         opacities = np.add.reduceat(members.opacities[ids].astype(np.float64), starts[:-1]) / np.diff(starts)
         extinctions = -log(1 - np.clip(opacities, 1e-4, MAX_OPACITY)) * scales[:, 1] * scales[:, 2]
     return Moments(
-        pooled[:, POOLED_MEAN], covars, pooled[:, POOLED_WEIGHT], pooled[:, POOLED_MASS], extinctions,
-        pooled[:, POOLED_FOOTPRINT], sh,
+        pooled[:, POOLED_MEAN], covars=covars, weights=pooled[:, POOLED_WEIGHT], masses=pooled[:, POOLED_MASS],
+        extinctions=extinctions, footprints=pooled[:, POOLED_FOOTPRINT], sh=sh,
     )  # fmt: skip
 
 

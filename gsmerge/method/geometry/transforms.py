@@ -260,7 +260,10 @@ def find_nearest(points: np.ndarray, count: int, rows: np.ndarray | None = None)
     def search(start: int) -> None:
         """Find the neighbours of a part of the given rows, and their distances."""
         part = slice(start, min(start + NEAREST_ROWS, len(rows)))
-        nearest_of_others(points, no_view, tree, axes, splits, part.start, part.stop, len(points), neighbours)
+        nearest_of_others(
+            points, no_view, order=tree, axes=axes, splits=splits, first=part.start, last=part.stop, most=len(points),
+            out=neighbours,
+        )  # fmt: skip
         distances[part] = np.sqrt(((points[neighbours[part]] - points[part, None]) ** 2).sum(2))
 
     with use_threads():

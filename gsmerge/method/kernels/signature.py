@@ -63,7 +63,9 @@ class Argument:
     def c(self) -> str:
         """The type in C."""
         name = _CODES[self.code][0]
-        return name if not self.shape else f"{name} *" if self.out else f"const {name} *"
+        if not self.shape:
+            return name
+        return f"{name} *" if self.out else f"const {name} *"
 
     @cached_property
     def dtype(self) -> np.dtype[Any]:

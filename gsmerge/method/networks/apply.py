@@ -302,7 +302,9 @@ def run_heads(
         offsets = np.arange(slots)[None]
         mask = offsets < sizes[rows, None]
         ids = starts[rows, None] + np.where(mask, offsets, 0)
-        outputs.append(_run_head(children, owners[rows], ids, mask, group_features, context))
+        outputs.append(
+            _run_head(children, owners[rows], ids=ids, mask=mask, group_features=group_features, context=context)
+        )
         output_rows[ids[mask]] = num_outputs + np.flatnonzero(mask)
         num_outputs += mask.size
     return scale_outputs(

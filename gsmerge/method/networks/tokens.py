@@ -71,7 +71,10 @@ def make_group_features(
     frames = np.empty((len(features), 3, 3), np.float32)
     sizes = np.empty(len(features), np.float32)
     place_frames(base.means, base.scales, _contiguous_viewmats(cameras), views, frames, sizes)
-    return GroupFeatures(features, base, frames, sizes, in_order(features.footprints), views, group)
+    return GroupFeatures(
+        features, base=base, frames=frames, sizes=sizes, footprints=in_order(features.footprints), views=views,
+        group=group,
+    )  # fmt: skip
 
 
 def contiguous(gaussians: Gaussians) -> Gaussians:
@@ -121,8 +124,9 @@ def part_tokens(
     g = group_features
     out = np.zeros((len(ids), columns), np.float32)
     describe_parts(
-        parts.means, parts.quats, parts.scales, parts.opacities, parts.sh0, g.base.means, g.base.sh0, g.frames,
-        g.sizes, g.footprints, ids.astype(np.int64, copy=False), owners, columns == MEMBER_COLUMNS, out,
+        parts.means, parts.quats, scales=parts.scales, opacities=parts.opacities, sh0=parts.sh0,
+        group_means=g.base.means, group_sh0=g.base.sh0, frames=g.frames, sizes=g.sizes, footprints=g.footprints,
+        ids=ids.astype(np.int64, copy=False), owners=owners, members=columns == MEMBER_COLUMNS, out=out,
     )  # fmt: skip
     return out
 

@@ -65,7 +65,10 @@ class _Render(torch.autograd.Function):
                 for tensor in (images[view], transmittances[view], grad_images[view], grad_alphas[view, ..., 0])
             )
             colors = view_colors(tiled)
-            grads = gradients_of(tiled, colors, image, transmittance, grad_image, -grad_alpha, with_viewmat)
+            grads = gradients_of(
+                tiled, colors, image=image, transmittance=transmittance, grad_image=grad_image, grad_left=-grad_alpha,
+                with_viewmat=with_viewmat,
+            )  # fmt: skip
             color_grads = color_gradients(tiled, grads.colors, colors, used=color_grads)
             columns = [
                 grads.means + color_grads.means,

@@ -97,7 +97,9 @@ def gradients_of(
         edges = [BLOCK * (num_blocks * i // num) for i in range(num)] + [m]
         parallel_map(project, pairwise(edges))
     viewmat = None if poses is None else viewmat_gradient(poses, splats.origin)
-    return Gradients(tiled.ids, means, quats, scales, opacities, color_sums, viewmat)
+    return Gradients(
+        tiled.ids, means=means, quats=quats, scales=scales, opacities=opacities, colors=color_sums, viewmat=viewmat
+    )
 
 
 def viewmat_gradient(poses: Array, origin: Array) -> Array:

@@ -217,7 +217,9 @@ def _list_by_tile(order: Array, boxes: Array, conics: Array, wanted: Array, thre
     spans = pieces(len(order), threads)
     counts = np.stack(parallel_map(lambda part: count_tiles(boxes[slice(*part)], *wanted.shape), spans))
     if hides_most(int(counts.sum()), len(order)):
-        return _list_open_tiles(order, boxes, conics, wanted.shape[0], wanted.shape[1], threads)
+        return _list_open_tiles(
+            order, boxes, conics=conics, tile_height=wanted.shape[0], tile_width=wanted.shape[1], threads=threads
+        )
     totals = counts.sum(0)
     is_wanted = wanted.reshape(-1)
     isect_offsets = np.concatenate([[0], np.cumsum(totals * is_wanted)])
@@ -312,7 +314,9 @@ def tile_view(
         raise ValueError(f"expected {len(splats)} opacities and keep flags, got {len(opacities)} and {num_flags}")
     local_viewmat = viewmat.copy()  # from the coordinates of the splats, whose zero is at `splats.origin`
     local_viewmat[:3, 3] += matmul(local_viewmat[:3, :3], splats.origin)
-    camera = camera_numbers(local_viewmat, K, width, height, eps2d, antialiased, near, far)
+    camera = camera_numbers(
+        local_viewmat, K, width=width, height=height, eps2d=eps2d, antialiased=antialiased, near=near, far=far
+    )
     tile_width = -(-width // projection.TILE)
     tile_height = -(-height // projection.TILE)
     # tiles
@@ -325,7 +329,7 @@ def tile_view(
     if tiles is not None and tiles.shape != (tile_height, tile_width):
         raise ValueError(f"tiles: expected shape {[tile_height, tile_width]}, got {list(tiles.shape)}")
     with use_threads() as threads:
-        ids, conics, depths, boxes = _project(splats, opacities, keep, tiles, camera, threads)
+        ids, conics, depths, boxes = _project(splats, opacities, keep=keep, tiles=tiles, camera=camera, threads=threads)
         if is_part:
             boxes[:, :2] = boxes[:, :2].clip(left, right)
             boxes[:, 2:] = boxes[:, 2:].clip(top, bottom)
@@ -335,6 +339,7 @@ def tile_view(
     eye = camera_centres(local_viewmat).astype(np.float32)
     first_row = top * projection.TILE
     return TiledView(
-        splats, ids, conics, depths, flatten_ids, isect_offsets, eye, opacities, camera, viewmat, width,
-        min(height, bottom * projection.TILE) - first_row, first_row,
+        splats, ids=ids, conics=conics, depths=depths, flatten_ids=flatten_ids, isect_offsets=isect_offsets, eye=eye,
+        opacities=opacities, camera=camera, viewmat=viewmat, width=width,
+        height=min(height, bottom * projection.TILE) - first_row, top=first_row,
     )  # fmt: skip

@@ -90,6 +90,8 @@ def weaken_contradicted(features: FeatureGaussians, members: Members, cameras: C
     """
     f = features
     nearest_views = 64  # each group is compared with this many nearest views; more hardly change the result
-    _, same_share, behind_share, *_ = cross_view_stats(f.means, f.sh0, f.views, members, cameras, nearest_views).T
+    _, same_share, behind_share, *_ = cross_view_stats(
+        f.means, f.sh0, views=f.views, members=members, cameras=cameras, most=nearest_views
+    ).T
     factors = np.where(behind_share > same_share, np.where(same_share > 0, DISPUTED, ALONE), 1)
     return replace(features, gains=features.gains * factors.astype(np.float32))

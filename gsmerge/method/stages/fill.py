@@ -201,5 +201,6 @@ def _continue_surfaces(
     rows = np.flatnonzero(possible.any(0))
     first_possible = depths[possible.argmax(0)[rows], rows]
     return make_round_gaussians(
-        eye, rays[rows], first_possible, NEW_SIZE_PIXELS / camera.Ks[0][0, 0], colors[rows], num_higher
-    )
+        eye, rays[rows], depths=first_possible, size=NEW_SIZE_PIXELS / camera.Ks[0][0, 0], colors=colors[rows],
+        num_higher=num_higher,
+    )  # fmt: skip

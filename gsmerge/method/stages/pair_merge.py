@@ -79,7 +79,10 @@ def cloud_of(g: Gaussians) -> Cloud:
     gaussian_moments(quats, scales, g.opacities.astype(np.float32).clip(MIN_OPACITY, 1), FLATNESS, covars, masses)
     sh = np.concatenate([g.sh0, g.shN], 1, dtype=np.float32).reshape(count, -1)
     ones = np.ones(count, np.int32)
-    return Cloud(g.means.astype(np.float64), covars, masses, ones.astype(np.float32), sh, ones, np.arange(count))
+    return Cloud(
+        g.means.astype(np.float64), covars=covars, masses=masses, weights=ones.astype(np.float32), sh=sh, sizes=ones,
+        rows=np.arange(count),
+    )  # fmt: skip
 
 
 def _merge_round(cloud: Cloud, count: int) -> Cloud:
@@ -101,8 +104,9 @@ def _merge_round(cloud: Cloud, count: int) -> Cloud:
         # merged Gaussians would look like haze
         cell_share = 0.2
         agglomerate(
-            cloud.means, cloud.covars, cloud.masses, cloud.weights, colors, order, starts, COLOR_WEIGHT, cell_share,
-            begin, end, pairs, costs,
+            cloud.means, cloud.covars, masses=cloud.masses, weights=cloud.weights, colors=colors, order=order,
+            starts=starts, color_weight=COLOR_WEIGHT, least_share=cell_share, first=begin, last=end, pairs=pairs,
+            costs=costs,
         )  # fmt: skip
 
     parallel_map(plan_merges, range(0, len(starts) - 1, CELLS_PER_TASK))
@@ -143,7 +147,9 @@ def gaussians_of_cloud(cloud: Cloud, source: Gaussians, wider: float = 0.0) -> G
     means = to_float32(cloud.means)
     quats = to_float32(quats)
     scales = to_float32(scales)
-    out = Gaussians(means, quats, scales, to_float32(opacities), sh[:, :1].copy(), sh[:, 1:].copy())
+    out = Gaussians(
+        means, quats=quats, scales=scales, opacities=to_float32(opacities), sh0=sh[:, :1].copy(), shN=sh[:, 1:].copy()
+    )
     unmerged = np.flatnonzero(cloud.sizes == 1)
     for name, column in vars(out).items():
         column[unmerged] = getattr(source, name)[cloud.rows[unmerged]]

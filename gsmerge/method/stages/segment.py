@@ -190,7 +190,9 @@ def region_tree(images: np.ndarray, depths: np.ndarray, groups: Groups, valid: n
     added = np.concatenate([[sum(errors)], np.concatenate(growths)[order]])
     distortions = np.cumsum(added) / (3 * max(sum(num_pixels), 1))
     min_regions = len(groups) - int(np.count_nonzero(heights < OVERSIZE))
-    return RegionTree(groups, parents, order, offsets, distortions, min_regions)
+    return RegionTree(
+        groups, parents=parents, order=order, offsets=offsets, distortions=distortions, min_regions=min_regions
+    )
 
 
 def cut_tree(tree: RegionTree, budget: int) -> Groups:

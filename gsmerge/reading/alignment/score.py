@@ -170,4 +170,6 @@ def check_pairs(pairs: Correspondences, cameras: Cameras) -> Alignment:
     in_front, within_1px, near = (float((errors <= px).sum()) / count for px in limits)
     is_near = [median_px < limit for median_px in medians if not math.isnan(median_px)]
     is_ok = bool(is_near) and all(is_near) and in_front > 0.5
-    return Alignment(medians, in_front, within_1px, near, limit, is_ok)
+    return Alignment(
+        medians, share_in_front=in_front, share_within_1px=within_1px, share_near=near, limit_px=limit, ok=is_ok
+    )

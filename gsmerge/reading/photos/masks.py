@@ -183,8 +183,9 @@ def read_masks(
     canvas = photos.canvas
     stored_counts = None if paths or is_plain else camera_file.counts
     mask_files = MaskFiles(
-        tuple(paths), turns, masks, protecting, part, canvas, stored, cut, cameras, stored_counts, is_plain
-    )
+        tuple(paths), turns=turns, masks=masks, protecting=protecting, part=part, canvas=canvas, stored=stored, cut=cut,
+        cameras=cameras, stored_counts=stored_counts, is_plain=is_plain,
+    )  # fmt: skip
     counts, importance = zip(*parallel_map(mask_files.read, range(len(masks))), strict=True)
     error, place = (CameraMaskError, camera_file.path) if by_cameras else (SceneError, files.masks or "")
     _refuse_photos(error, place, "masks", masks, photos.pictures)

@@ -327,7 +327,9 @@ def read_photos(photos: ScenePhotos, camera_file: CameraFile) -> ScenePhotos:
     damaged = dict[Path, str]()
     part = photos.fit.part
     canvas = photos.canvas
-    pictures = decode_photos(photos.paths, photos.turns, photos.fit.stretch(size), part, damaged, canvas)
+    pictures = decode_photos(
+        photos.paths, photos.turns, size=photos.fit.stretch(size), part=part, damaged=damaged, canvas=canvas
+    )
     return replace(photos, pictures=pictures, damaged=damaged)
 
 

@@ -120,7 +120,7 @@ def _plot_against(results: Results, cost: str, name: str, title: str, cost_words
             " differences between settings, without those between scenes."
         )
     caption = f"{results.caveat}Quality against {cost_words}. Measured on {PARTS[results.part]}. {about}"
-    return Chart(name, title, caption, x_label, head, tuple(rows), tuple(panels))
+    return Chart(name, title=title, caption=caption, x_label=x_label, head=head, rows=tuple(rows), panels=tuple(panels))
 
 
 def draw_figures(figures: Sequence[Chart], folder: Path) -> dict[str, bytes]:

@@ -175,16 +175,12 @@ def light_room(room: Room) -> LitRoom:
     axes = np.stack(all_axes)
     from_below = 0.5  # brightness of light from below, relative to light from above
     return LitRoom(
-        room,
-        pack_shapes(room.shapes),
-        tuple(make_mipmaps(texture) for texture in room.textures),
-        axes,
-        middle,
-        radius,
-        np.stack([_shadow_map(opaque, a, middle, radius, KEY_SIZE) for a in axes[:KEY_MAPS]]),
-        np.stack([_shadow_map(opaque, a, middle, radius, AMBIENT_SIZE) for a in axes[KEY_MAPS:]]),
-        np.where(-ambient[:, 1] > 0, 1.0, from_below) * 4 / AMBIENT_MAPS,
-    )
+        room, shapes=pack_shapes(room.shapes), mips=tuple(make_mipmaps(texture) for texture in room.textures),
+        axes=axes, middle=middle, radius=radius,
+        key=np.stack([_shadow_map(opaque, a, middle, radius, KEY_SIZE) for a in axes[:KEY_MAPS]]),
+        ambient=np.stack([_shadow_map(opaque, a, middle, radius, AMBIENT_SIZE) for a in axes[KEY_MAPS:]]),
+        weights=np.where(-ambient[:, 1] > 0, 1.0, from_below) * 4 / AMBIENT_MAPS,
+    )  # fmt: skip
 
 
 def texture_coordinates(shapes: ShapeArrays, ids: NDArray[np.int32], points: Float) -> tuple[Float, Float]:
@@ -249,7 +245,7 @@ def render_light(lit: LitRoom, c2w: Array, lens: Pinhole, samples: int) -> Float
     out = np.zeros((h * w, 3), np.float32)
     rows = np.flatnonzero(hits.ids.reshape(-1) >= 0)
     if len(rows):
-        out[rows] = _reflect(lit, hits, rows, c2w, lens, samples)
+        out[rows] = _reflect(lit, hits, rows=rows, c2w=c2w, lens=lens, samples=samples)
     return out.reshape(h, w, 3).reshape(lens.height, samples, lens.width, samples, 3).mean((1, 3))
 
 
@@ -269,7 +265,7 @@ def _reflect(lit: LitRoom, hits: Hits, rows: NDArray[np.int64], c2w: Array, lens
     spread = (depth / (lens.focal * samples)).astype(np.float32) / np.sqrt(cosine)
     gamma = 2.2  # exponent from sRGB to linear light
     albedo = power(look_up_colors(lit, ids, points, spread), gamma)
-    return _shade(lit, ids, albedo, positions, normals, directions)
+    return _shade(lit, ids, albedo=albedo, positions=positions, normals=normals, rays=directions)
 
 
 def _shade(lit: LitRoom, ids: NDArray[np.int32], albedo: Float, positions: Float, normals: Float, rays: Float) -> Float:

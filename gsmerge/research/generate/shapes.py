@@ -151,13 +151,11 @@ class ShapeArrays:
 def pack_shapes(shapes: Sequence[Shape]) -> ShapeArrays:
     """Convert at least one shape to arrays."""
     return ShapeArrays(
-        tuple(shapes),
-        np.array([s.kind for s in shapes], np.int32),
-        np.stack([s.rotation for s in shapes]).astype(float),
-        np.stack([s.centre for s in shapes]).astype(float),
-        np.array([s.size for s in shapes], float),
-        np.stack([s.waves for s in shapes]).astype(float),
-    )
+        tuple(shapes), kinds=np.array([s.kind for s in shapes], np.int32),
+        rotations=np.stack([s.rotation for s in shapes]).astype(float),
+        centres=np.stack([s.centre for s in shapes]).astype(float), sizes=np.array([s.size for s in shapes], float),
+        waves=np.stack([s.waves for s in shapes]).astype(float),
+    )  # fmt: skip
 
 
 def half_sizes(shapes: ShapeArrays) -> Array:

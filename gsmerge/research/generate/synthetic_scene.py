@@ -227,7 +227,9 @@ def _plan_session(rng: np.random.Generator, options: GenerateOptions) -> _PhotoS
     previews = [render_light(lit, pose, _shrink_lens(lens), 1) for pose in poses[::2]]
     brightness = 0.22, 0.62  # range of the mean of a scene's photos, sRGB
     gain = find_exposure(previews, rng.uniform(*brightness))
-    return _PhotoSession(lit, poses, np.eye(4), lens, photo_lens, noise, gain)
+    return _PhotoSession(
+        lit, poses=poses, to_export=np.eye(4), lens=lens, photo_lens=photo_lens, noise=noise, gain=gain
+    )
 
 
 def _shrink_lens(lens: Pinhole) -> Pinhole:

@@ -142,7 +142,12 @@ def draw_color(
 
     Without a range of hues, half of the colours are warm, and the other half has any hue.
     """
-    h = (rng.normal(0.08, 0.06) % 1 if rng.random() < 0.5 else rng.random()) if hue is None else rng.uniform(*hue) % 1
+    if hue is not None:
+        h = rng.uniform(*hue) % 1
+    elif rng.random() < 0.5:
+        h = rng.normal(0.08, 0.06) % 1
+    else:
+        h = rng.random()
     s = strength[0] + (strength[1] - strength[0]) * rng.random() ** 1.5
     v = rng.uniform(*light)
     pure = np.clip(np.abs(np.mod(6 * h + np.array([0, 4, 2]), 6) - 3) - 1, 0, 1)  # RGB of the hue at s = v = 1
@@ -242,7 +247,8 @@ def draw_cloth(rng: np.random.Generator, size: int) -> Texture:
     other = draw_color(rng, strength=(0.0, 0.7))
     bands = [(np.mod(count * c, 1) < rng.uniform(0.2, 0.6)).astype(np.float32) for c in (x, y)]
     kind = rng.integers(0, 3)
-    amount = bands[0] if kind == 0 else 0.5 * bands[0] + 0.5 * bands[1] if kind == 1 else np.zeros_like(x)
+    amounts = bands[0], 0.5 * bands[0] + 0.5 * bands[1], np.zeros_like(x)
+    amount = amounts[kind]
     threads = 2 ** int(rng.integers(5, 8))
     weave = 0.5 + 0.5 * sin(2 * np.pi * threads * x) * sin(2 * np.pi * threads * y)
     shade = 0.75 + 0.15 * weave + 0.2 * (draw_octaves(rng, size, fade=0.7) - 0.5)

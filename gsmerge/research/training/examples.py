@@ -117,8 +117,8 @@ def make_example(training: TrainingScene, options: TrainOptions, density: float,
     # A footprint is the size of a pixel at the Feature Gaussian's depth, so it is the depth over the focal length
     unit = float(lower_median(features.footprints * focals.astype(np.float64)[features.views]))
     return Example(
-        name, unit, members, scene.cameras, features, feature_to_gaussians(features),
-        blank_photos(training.cameras, level), images, measure_covered(training, level),
+        name, unit=unit, members=members, cameras=scene.cameras, features=features, base=feature_to_gaussians(features),
+        photos=blank_photos(training.cameras, level), images=images, covers=measure_covered(training, level),
     )  # fmt: skip
 
 

@@ -159,7 +159,10 @@ def train(
                 _save_run(out, state, rows, facts, options)
     paths = (out / "best.safetensors", out / "last.safetensors", out / "losses.csv")
     best_psnr = max(row["psnr_learned"] for row in rows)
-    return TrainResult(*paths, step, rows[-1]["loss"], rows[-1]["psnr_analytic"], best_psnr, resumed)
+    return TrainResult(
+        *paths, step=step, loss=rows[-1]["loss"], psnr_analytic=rows[-1]["psnr_analytic"], psnr_learned=best_psnr,
+        resumed=resumed,
+    )  # fmt: skip
 
 
 def _save_run(
@@ -210,7 +213,9 @@ def _take_step(
         example = draw_example(shards[int(rng.integers(len(shards)))], options, rng, read)
         if options.recolor:
             example = recolor(example, rng)
-        window = sample_window(example, options.levels, options.window, options.most, options.novel, rng)
+        window = sample_window(
+            example, options.levels, side=options.window, most=options.most, novel=options.novel, rng=rng
+        )
         with torch.enable_grad():
             loss = window_loss(state.networks, window, options, step, rng)
             gradients = [torch.zeros_like(parameter) for parameter in parameters]

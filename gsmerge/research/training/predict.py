@@ -93,7 +93,9 @@ def differentiate_base(features: FeatureGaussians) -> Gaussians:
     scales, quats = differentiate_axes(features.covars)
     depths = features.extinctions * as_tensor(features.gains) / (scales[:, 1] * scales[:, 2])
     opacities = (1 - torch.exp(-depths)).clamp(0, MAX_OPACITY)
-    return Gaussians(features.means, quats, scales, opacities, features.sh0, as_tensor(features.shN))
+    return Gaussians(
+        features.means, quats=quats, scales=scales, opacities=opacities, sh0=features.sh0, shN=as_tensor(features.shN)
+    )
 
 
 def differentiate_groups(features: FeatureGaussians, inputs: GroupFeatures, viewmats: np.ndarray) -> GroupFeatures:
