@@ -1,9 +1,10 @@
 """A run, from its first function to its last: read -> prepare -> plan -> build -> score -> write.
 
-:func:`compact_files` reads and writes, :func:`compact_scene` prepares and plans, and :func:`compact_prepared` builds
-and scores. A plain run goes through these functions from top to bottom. :func:`gsmerge.method.pipelines.build.build`
-calls the stages in their order. Every other run, such as a search for the number of Gaussians, is one call behind an
-``if``; its module calls ``build`` as often as it needs.
+:func:`compact_files` reads and writes, :func:`compact_scene` crops and repeats, :func:`plan_run` prepares and plans,
+and :func:`compact_prepared` builds and scores. A plain run goes through these functions from top to bottom.
+:func:`gsmerge.method.pipelines.build.build` calls the stages in their order. Every other run, such as a search for the
+number of Gaussians, is one call behind an ``if``; its module calls ``build`` as often as it needs, but for blocks,
+which are merged apart and fitted together.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ from gsmerge.reading.file_stats import doubt_changed
 from gsmerge.reading.input import as_scene, read_input
 from gsmerge.reading.read_scene import Loaded
 from gsmerge.reading.scene_files import SceneFiles, scene_title
-from gsmerge.results.candidate import Candidate, score
+from gsmerge.results.candidate import Candidate, make_candidate
 from gsmerge.results.outputs import (
     Outputs,
     add_outputs,
@@ -216,7 +217,7 @@ def compact_prepared(prepared: Prepared, plan: Plan) -> CompactResult:
         best = search_count(prepared, plan)
     else:
         begin_part("build")
-        best = score(build(prepared, plan, plan.count.limits.count), prepared, plan)
+        best = make_candidate(build(prepared, plan, plan.count.limits.count), prepared, plan)
     if plan.count.levels > 1:
         from gsmerge.counts.search import build_levels
 

@@ -72,7 +72,7 @@ _json_lines: ContextVar[JsonLines | None] = ContextVar("json_lines", default=Non
 
 def one_line(text: str) -> str:
     """Escape the characters of a text that no terminal prints, such as line breaks, and shorten it if it is long."""
-    clean = text if text.isprintable() else "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+    clean = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
     max_line = 5000  # characters
     return clean if len(clean) <= max_line else f"{clean[: max_line // 2]} ... {clean[-max_line // 2 :]}"
 

@@ -10,7 +10,7 @@ from gsmerge.method.fit import Fitted
 from gsmerge.method.pipelines.build import build
 from gsmerge.method.pipelines.plan import Plan
 from gsmerge.method.stages.clean import clean, describe_counts, faintest_dropped
-from gsmerge.results.candidate import Candidate, score
+from gsmerge.results.candidate import Candidate, make_candidate
 from gsmerge.runtime.record import Record, add_seconds, adopt, begin_part, note, record_choices, record_part
 from gsmerge.types import Gaussians
 
@@ -22,7 +22,7 @@ def build_candidate(prepared: Prepared, plan: Plan, count: int | None) -> Candid
     """Build one of several results of a run, clean it up as the plan says, and score it, with a record of its own."""
     begin_part("build")
     fitted = build_cleaned(prepared, plan, count) if plan.clean.asked else build(prepared, plan, count)
-    return score(fitted, prepared, plan, count)
+    return make_candidate(fitted, prepared, plan, count)
 
 
 def build_cleaned(prepared: Prepared, plan: Plan, count: int | None) -> Fitted:

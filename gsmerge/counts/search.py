@@ -17,7 +17,7 @@ from gsmerge.method.pipelines.plan import CountPlan, Plan
 from gsmerge.method.stages.segment import knee_count
 from gsmerge.plan.counts import FIDELITY_LOSS, level_counts
 from gsmerge.plan.forecast import STAGE_STEPS, run_parts
-from gsmerge.results.candidate import Candidate, score
+from gsmerge.results.candidate import Candidate, make_candidate
 from gsmerge.results.left_out import LeftOut, choose_left_out, leave_out, mean_seen
 from gsmerge.results.scores import compares_all_pixels, may_leave_gaps, measure_input, measure_renders
 from gsmerge.runtime.record import (
@@ -117,7 +117,7 @@ def _reach_target(prepared: Prepared, plan: Plan) -> Candidate:
             adopt(best.record)
             gaussians, dropped = clean_fitted(best.fitted, prepared, plan)
             record_dropped(dropped, len(gaussians), None, prepared)
-            best = score(replace(best.fitted, gaussians=gaussians), prepared, plan)
+            best = make_candidate(replace(best.fitted, gaussians=gaussians), prepared, plan)
         add_seconds(record.seconds)
     best.record.choices["search"] = search.choices
     return replace(best, unmet=search.describe_unmet(len(best.gaussians)))

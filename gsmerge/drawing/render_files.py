@@ -190,7 +190,9 @@ def prepare_panel(options: DrawOptions) -> Drawing:
     def draw(_: int) -> Iterator[BytePicture]:
         """Yield the panel: rows of photos and renders, then a row from outside."""
         named = [(path.name, gaussians) for path, gaussians in group.scenes]
-        shown = None if photos is None else [photos[i] if i in pictured else None for i in ids]
+        shown: list[BytePicture | None] | None = None
+        if photos is not None:
+            shown = [photos[i] if i in pictured else None for i in ids]
         if shown and options.size:
             shown = [None if photo is None else fill_photo(photo, *options.size) for photo in shown]
         marks = [info.antialiased for info in group.infos]

@@ -224,7 +224,8 @@ def inspection_lines(scene: Mapping[str, Any]) -> list[str]:
     for number, batch in enumerate(scene["batches"], 1):
         count, before, after = (batch.get(name, 0) for name in ("num_views", "num_input", "num_new"))
         names = batch["views"]
-        shown = f", {names[0]}{f' to {names[-1]}' if len(names) > 1 else ''}" if names else ""
+        ends = names if len(names) < 2 else [names[0], names[-1]]
+        shown = f", {' to '.join(ends)}" if names else ""
         batches.append(f"batch {number:<5}{count} views{shown}; {before:,} -> {after:,} Gaussians")
     is_inside = scene["num_views"] and set(_CAMERA_ELEMENTS) <= set(scene["extra_elements"])
     cameras = scene["cameras"] or ("inside the .ply" if is_inside else "none found")

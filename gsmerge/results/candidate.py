@@ -30,7 +30,7 @@ class Candidate:
     unmet: str | None = None  # Why it does not meet the target of a search; None if it does, or without a target
 
 
-def score(fitted: Fitted, prepared: Prepared, plan: Plan, count: int | None = None) -> Candidate:
+def make_candidate(fitted: Fitted, prepared: Prepared, plan: Plan, count: int | None = None) -> Candidate:
     """Move fitted canonical Gaussians into the world, and measure their PSNR; ``count`` is the number asked for."""
     moved = with_moved_views(prepared, fitted.cameras)
     gaussians = moved.frame.leave(fitted.gaussians)

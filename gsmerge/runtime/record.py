@@ -20,7 +20,7 @@ from gsmerge.runtime.memory import release_memory
 Progress = Callable[[str, int, int], None]  # takes the name of the stage, the number of steps done, and of all steps
 STAGES = (
     "partition", "prepare", "segment", "curve", "reduce", "members", "encode", "match", "refine",
-    "cover", "decode", "join", "fit", "prune", "fill", "score", "input",
+    "decode", "join", "fit", "prune", "fill", "score", "input",
 )  # fmt: skip
 FIT_STEP = "fit: "  # texts that report steps of a fit begin with this text
 BEFORE_FIT = 0.8  # share of the work of the stages without fits that is done before the fits

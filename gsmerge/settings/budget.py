@@ -164,7 +164,8 @@ def parse_budget(budget: str | int | None, num_input: int) -> int:
     match = re.fullmatch(rf"(?:{COUNT_PATTERN})|(\d*\.?\d+)\s*%", text, re.ASCII | re.IGNORECASE)
     if not match:
         is_fraction = re.fullmatch(r"\d*\.\d+", text, re.ASCII) is not None
-        percent = float(text) * (100 if float(text) < 1 else 1) if is_fraction else 0.0
+        percent = float(text) if is_fraction else 0.0
+        percent *= 100 if percent < 1 else 1
         hint = f'; perhaps "{percent:g}%"' if 0 < percent <= 100 else suggest_name(text, (AUTO, *DEVICES))
         hint = f"; --quality {text} asks for a PSNR" if text.lower().endswith("db") else hint
         raise ValueError(

@@ -15,7 +15,7 @@ from gsmerge.method.stages.prune import ROUNDING
 from gsmerge.runtime.record import STAGES
 from gsmerge.settings.stages import SEGMENTATIONS
 
-UNUSUAL = ("partition", "curve", "reduce", "refine", "cover", "choose", "join")
+UNUSUAL = ("partition", "curve", "reduce", "refine", "join")
 USUAL = [stage for stage in STAGES if stage not in UNUSUAL]
 UNFITTED = {"fit": "none", "checkpoint": "none"}
 

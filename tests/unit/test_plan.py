@@ -32,7 +32,7 @@ from gsmerge.plan.make_plan import is_without_views, make_plan, plan_scene
 from gsmerge.plan.networks import choose_networks
 from gsmerge.prepare.confirm_depths import confirm_depths
 from gsmerge.prepare.prepare_scene import prepare
-from gsmerge.results.candidate import score
+from gsmerge.results.candidate import make_candidate
 from gsmerge.runtime.record import record_run
 from gsmerge.settings.compact import EFFORT_NAMES as NAMES
 from gsmerge.settings.fit import GROW_STEPS
@@ -249,7 +249,7 @@ def test_an_input_with_holes_is_compared_where_it_has_gaussians(scene: Scene) ->
     plan = add_target(plan_of(rows), prepared)
     assert plan.count.target_psnr == plan.score.before.covered_psnr - FIDELITY_LOSS > plan.score.before.psnr
     given = prepared.frame.enter(rows.gaussians)  # without those that fill the holes
-    again = score(Fitted(given, prepared.scene.cameras, None), prepared, plan)
+    again = make_candidate(Fitted(given, prepared.scene.cameras, None), prepared, plan)
     assert again.psnr == pytest.approx(plan.score.before.psnr, abs=0.01)
     assert again.deciding_psnr == pytest.approx(plan.score.before.covered_psnr, abs=0.01)
 

@@ -37,14 +37,14 @@ from gsmerge.io.bounds import (
     read_json,
     read_text,
 )
-from gsmerge.io.formats import rows as arrays
+from gsmerge.io.formats import rows as row_values
 from gsmerge.io.formats.table import META, PLAIN, Contents
 from gsmerge.method.kernels.elementary import expm1, log1p
 from gsmerge.types import Gaussians
 
 MAX_DEGREE = 3  # of harmonics, the highest of the format
 VERSION = 2  # of the format, as its metadata states it
-MODELS = {arrays.MIP: "antialiased", arrays.FLAT: "2dgs"}  # splat-transform's names of the modes of rendering
+MODELS = {row_values.MIP: "antialiased", row_values.FLAT: "2dgs"}  # splat-transform's names of the modes of rendering
 GENERATOR = "gsmerge"
 # Names of all files that writers of the format make
 SOG_FILES = (
@@ -108,18 +108,18 @@ _Files = _ZipFiles | _FolderFiles
 class SogContent:
     """Content of one ``.sog``."""
 
-    packed: arrays.Packed
+    packed: row_values.Packed
     sizes: dict[str, int]  # attribute -> bytes of its textures
-    mode: str | None  # mode of rendering, see arrays.render_mode
+    mode: str | None  # mode of rendering, see row_values.render_mode
     num_bytes: int  # of all files
 
 
-def read_rows(path: Path) -> arrays.StoredRows:
+def read_rows(path: Path) -> row_values.StoredRows:
     """Read the Gaussians of a ``.sog``; raise SceneError if it is no ``.sog`` of version 2, or is damaged."""
     budget = read_budget(path)
     with _damage_errors(path), open_archive(path) as archive:
         content = _read_content(_ZipFiles(archive, budget.file_bytes), budget)
-    return arrays.to_stored([content.packed], f".sog version {VERSION}", content.sizes, content.mode)
+    return row_values.to_stored([content.packed], f".sog version {VERSION}", content.sizes, content.mode)
 
 
 def read_unzipped(path: Path) -> SogContent:
@@ -134,11 +134,11 @@ def read_unzipped(path: Path) -> SogContent:
         return _read_content(_FolderFiles(path.parent, size), ReadBudget(path, size))
 
 
-def read_folder(path: Path) -> arrays.StoredRows:
+def read_folder(path: Path) -> row_values.StoredRows:
     """Read the rows of a ``.sog`` without its zip, by its ``meta.json``; raise SceneError as in :func:`read_rows`."""
     content = read_unzipped(path)
     meta_bytes = check_file(path)
-    rows = arrays.to_stored([content.packed], f"unzipped .sog version {VERSION}", content.sizes, content.mode)
+    rows = row_values.to_stored([content.packed], f"unzipped .sog version {VERSION}", content.sizes, content.mode)
     return replace(rows, bytes_beside=content.num_bytes - meta_bytes)
 
 
@@ -166,7 +166,7 @@ def _damage_errors(path: Path) -> Iterator[None]:
         raise SceneError(path, problem, "export it again") from error
     except zlib.error as error:
         problem = f"expected a readable .sog file, found a damaged one ({error})"
-        raise SceneError(path, problem, arrays.EXPORT_AGAIN) from error
+        raise SceneError(path, problem, row_values.EXPORT_AGAIN) from error
 
 
 def _read_content(files: _Files, budget: ReadBudget) -> SogContent:
@@ -178,9 +178,9 @@ def _read_content(files: _Files, budget: ReadBudget) -> SogContent:
         raise SceneError(budget.path, problem, f"export it as version {VERSION}")
     count = check_whole(meta["count"], "count", 1)
     bands = check_whole(meta["shN"]["bands"], "bands", 1, MAX_DEGREE) if meta.get("shN") else 0
-    arrays.check_gaussian_count(budget, count, (bands + 1) ** 2 - 1, PACKED_BYTES)
+    row_values.check_gaussian_count(budget, count, (bands + 1) ** 2 - 1, PACKED_BYTES)
     modes_by_model = {model: mode for mode, model in MODELS.items()}
-    mode = modes_by_model.get(str(meta.get("model")), arrays.MIP if meta.get("antialias") is True else None)
+    mode = modes_by_model.get(str(meta.get("model")), row_values.MIP if meta.get("antialias") is True else None)
     packed = _read_packed(files, meta, count, budget)
     keys = [key for key in ("means", "scales", "quats", "sh0", "shN") if meta.get(key)]
     sizes = {key: sum(files.num_bytes(name) for name in meta[key]["files"]) for key in keys}
@@ -218,7 +218,7 @@ def _read_texture(files: _Files, name: str, count: int, budget: ReadBudget) -> n
     return cv2.cvtColor(image, order).reshape(width * height, 4)[:count]
 
 
-def _read_packed(files: _Files, meta: dict[str, Any], count: int, budget: ReadBudget) -> arrays.Packed:
+def _read_packed(files: _Files, meta: dict[str, Any], count: int, budget: ReadBudget) -> row_values.Packed:
     """Decode textures and codebooks, and return the Gaussians that they hold; raise ValueError for damaged content."""
 
     def texture(key: str, index: int = 0, channels: int = 3) -> np.ndarray:
@@ -246,21 +246,21 @@ def _read_packed(files: _Files, meta: dict[str, Any], count: int, budget: ReadBu
         palette = centroids.reshape(-1, num_higher, 3)
         harmonic_codes = _to_numbers(meta["shN"]["codebook"], CODES)
 
-    def unpack(block: slice) -> arrays.Columns:
+    def unpack(block: slice) -> row_values.Columns:
         """Return the Gaussians of a block of rows."""
         largest = quats[block, 3].astype(int) - FIRST_MODE
         smallest = (quats[block, :3] / 255 - 0.5) * np.sqrt(2.0)
         codes = np.zeros((len(largest), 0, 3), np.uint8) if labels is None else palette[labels[block]]
-        return arrays.Columns(
+        return row_values.Columns(
             means=_decode_means(low_bytes[block] + 256.0 * high_bytes[block], mins, maxs),
-            quats=arrays.from_smallest_three(largest, smallest),
+            quats=row_values.from_smallest_three(largest, smallest),
             log_scales=scale_codes[scales[block]],
             opacities=sh0[block, 3] / 255,
             sh0=color_codes[sh0[block, :3]],
             harmonics=harmonic_codes[codes],
         )
 
-    return arrays.Packed(count, palette.shape[1], unpack)
+    return row_values.Packed(count, palette.shape[1], unpack)
 
 
 def _to_numbers(values: Any, length: int) -> np.ndarray:
@@ -276,21 +276,21 @@ def sog_bytes(gaussians: Gaussians, contents: Contents = PLAIN) -> bytes:
 
     Comments may state the mode of rendering, see :func:`gsmerge.io.formats.rows.render_mode`.
     """
-    columns = arrays.to_columns(gaussians, MAX_DEGREE).along_curve()
+    columns = row_values.to_columns(gaussians, MAX_DEGREE).along_curve()
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w") as archive:
-        for name, data in sog_files(columns, arrays.render_mode(contents.comments)).items():
+        for name, data in sog_files(columns, row_values.render_mode(contents.comments)).items():
             member = zipfile.ZipInfo(name)  # with the date 1980
             member.create_system = 3  # Unix on every system, so that equal files give equal archives
             archive.writestr(member, data)
     return content.getvalue()
 
 
-def sog_files(columns: arrays.Columns, mode: str | None = None) -> dict[str, bytes]:
+def sog_files(columns: row_values.Columns, mode: str | None = None) -> dict[str, bytes]:
     """Encode the files of a ``.sog`` by name: textures, whose pixels have the order of the rows, and ``meta.json``."""
     count = len(columns)
     meta: dict[str, Any] = {"version": VERSION, "asset": {"generator": GENERATOR}, "count": count}
-    meta["antialias"] = mode == arrays.MIP
+    meta["antialias"] = mode == row_values.MIP
     if mode is not None:
         meta["model"] = MODELS[mode]
     textures: dict[str, bytes] = {}
@@ -308,10 +308,12 @@ def sog_files(columns: arrays.Columns, mode: str | None = None) -> dict[str, byt
     add(
         "scales", {"scales.webp": _encode_texture(nearest_codes(scales, columns.log_scales))}, codebook=_shorten(scales)
     )
-    largest, smallest = arrays.smallest_three(columns.quats)
-    quats = np.concatenate([arrays.to_bytes(255 * (smallest / np.sqrt(2.0) + 0.5)), FIRST_MODE + largest[:, None]], 1)
+    largest, smallest = row_values.smallest_three(columns.quats)
+    quats = np.concatenate(
+        [row_values.to_bytes(255 * (smallest / np.sqrt(2.0) + 0.5)), FIRST_MODE + largest[:, None]], 1
+    )
     add("quats", {"quats.webp": _encode_texture(quats)})
-    colors = np.concatenate([nearest_codes(sh0, columns.sh0), arrays.to_bytes(255 * columns.opacities)[:, None]], 1)
+    colors = np.concatenate([nearest_codes(sh0, columns.sh0), row_values.to_bytes(255 * columns.opacities)[:, None]], 1)
     add("sh0", {"sh0.webp": _encode_texture(colors)}, codebook=_shorten(sh0))
     if columns.harmonics.size:
         num_higher = columns.harmonics.shape[1]
@@ -324,7 +326,7 @@ def sog_files(columns: arrays.Columns, mode: str | None = None) -> dict[str, byt
             "shN_centroids.webp": _encode_webp(centroids.reshape(rows, PALETTE_COLUMNS * num_higher, 3)),
             "shN_labels.webp": _encode_texture(np.stack([labels & 255, labels >> 8, np.zeros_like(labels)], 1)),
         }
-        bands = arrays.sh_degree(num_higher)
+        bands = row_values.sh_degree(num_higher)
         add("shN", files, count=len(palette), bands=bands, codebook=_shorten(codebook))
     return {**textures, META: json.dumps(meta).encode("ascii")}
 

@@ -33,8 +33,8 @@ class Reference:
 
     @property
     def of_views(self) -> bool:
-        """Return whether the pictures are photos or the colours of the views' own Gaussians, and not renders."""
-        return self.name != RENDERS
+        """Return whether pictures are chosen that are photos or the colours of the views' Gaussians, not renders."""
+        return self.name not in ("", RENDERS)
 
 
 @dataclass(frozen=True, eq=False)

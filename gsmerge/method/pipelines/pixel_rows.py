@@ -46,8 +46,8 @@ def build_from_pixels(prepared: Prepared, plan: Plan, count: int | None) -> Fitt
     added = seen[:0]
     if fills_gaps:
         added = fill_between(seen, fitted.cameras, fitted.outside, len(unseen), beyond=plan.fit.beyond)
-    kept_unseen = unseen[: len(unseen) - len(added) if plan.fit.fills or not plan.prunes else 0]
-    gaussians = Gaussians.concat([seen, kept_unseen, added])
+    num_unseen = len(unseen) - len(added) if plan.fit.fills or not plan.prunes else 0
+    gaussians = Gaussians.concat([seen, unseen[:num_unseen], added])
     if plan.prunes:
         most = start.count if plan.fit.grows else len(start.gaussians)
         record_choices(pruned=max(0, most - len(gaussians)))

@@ -177,8 +177,8 @@ def region_tree(images: np.ndarray, depths: np.ndarray, groups: Groups, valid: n
         pairs = adjacent_pairs(labels)
         # Weight of squared distances in pixels, relative to squared differences of colours. If distances had a smaller
         # weight, regions would become long and winding, so that no Gaussian fits them
-        compactness = 1e-5
-        return *merge_order(pairs, rows, DEPTH_WEIGHT, compactness, max_extent), error, int((usable > 0).sum())
+        region_compactness = 1e-5
+        return *merge_order(pairs, rows, DEPTH_WEIGHT, region_compactness, max_extent), error, int((usable > 0).sum())
 
     merged_views = parallel_map(merge_view, range(len(images)))
     parents, view_heights, growths, errors, num_pixels = zip(*merged_views, strict=True)
