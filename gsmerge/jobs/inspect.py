@@ -176,7 +176,7 @@ def _describe_scene(load: Loaded, *, is_result: bool) -> dict[str, Any]:
     names = ("finite", "views", "frame", "sizes")
     with record_part(silent=True) as record:
         if len(distinct.gaussians) > 0:
-            steps = select(*names, "pixels", "photos") if len(distinct) else select(*names)
+            steps = select(*names, "pixels", "background", "photos") if len(distinct) else select(*names)
             prepared = take_steps(steps, begin(distinct))
             canonical = prepared.scene
             changes = prepared.changes

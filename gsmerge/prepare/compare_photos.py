@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsmerge.errors import Doubt, count_words
+from gsmerge.errors import Doubt
 from gsmerge.method.compare.assign_photos import Assigner, Candidates
 from gsmerge.method.compare.colors import (
     EXPOSURE_STEP,
@@ -103,18 +103,10 @@ def compare_photos(scene: PicturedScene, look: Look = "auto") -> tuple[PicturedS
     pictures = None
     if scene.has_own_pixels:
         hidden, pictures = _find_hidden(scene, changes)
-        _note_hidden(scene, hidden, matching)
     changed = [view for view in matching if hidden[view].any() or changes[view] or view in grey]
     if changed:
         record_choices(photos_changed=[scene.names[view] for view in changed])
-    num_covered = sum(bool(hidden[view].any()) for view in matching)
-    said = [toned] if toned else []
-    if grey:
-        said.append(f"{count_words(len(grey), 'grey photo')} got the hues of the Gaussians")
-    if num_covered:
-        share = 100 * max(float(hidden[view].mean()) for view in matching)
-        covered = f"{count_words(num_covered, 'photo')} covered with the Gaussians' colours where they differ"
-        said.append(f"{covered}, up to {share:.2g} % of a photo")
+    said = [_describe_grey(scene, grey) if grey else "", toned, _describe_hidden(scene, hidden, matching)]
     return _change_photos(scene, changes, hidden, pictures, matching), tuple(matching), said
 
 
@@ -172,7 +164,7 @@ def find_grey(pairs: Pairs, views: Sequence[int]) -> dict[int, float]:
 
 
 def _color_photos(scene: PicturedScene, grey: Mapping[int, float]) -> PicturedScene:
-    """Give grey photos the hues of the Gaussians, but keep the photos' brightness; note which photos are grey.
+    """Give grey photos the hues of the Gaussians, but keep the photos' brightness.
 
     ``grey`` is the result of :func:`find_grey`.
     """
@@ -184,12 +176,17 @@ def _color_photos(scene: PicturedScene, grey: Mapping[int, float]) -> PicturedSc
         colors = draw_canonical(scene.gaussians, scene.cameras[views], max(scene.images.shape[1:3])).pictures
     for view, picture in zip(views, colors, strict=True):
         changes[view] = PhotoChange(cover=np.full(picture.shape[:2], True), colors=picture, keeps_brightness=True)
-    note(
+    return _apply_changes(scene, changes)
+
+
+def _describe_grey(scene: PicturedScene, grey: Mapping[int, float]) -> str:
+    """Say which photos are grey; ``grey`` is the result of :func:`find_grey`."""
+    names = list_some([scene.names[view] for view in grey])
+    return (
         f"{len(grey)} of {len(scene.photo_views)} photos are grey or of one tint (their hues vary by"
         f" {100 * max(grey.values()):.0f} % of the Gaussians' at most): only their brightness counts, and the Gaussians"
-        f" keep their hues; --set look=photos makes them grey: {list_some([scene.names[view] for view in grey])}"
+        f" keep their hues ({names}; --set look=photos makes them grey)"
     )
-    return _apply_changes(scene, changes)
 
 
 def have_other_tones(scene: PicturedScene, views: Sequence[int]) -> bool:
@@ -286,18 +283,17 @@ def _is_mapped(pairs: Pairs) -> bool:
     )
 
 
-def _note_hidden(scene: PicturedScene, hidden: np.ndarray, views: Sequence[int]) -> None:
-    """Note in which photos of ``views`` something covers the scene, at the pixels ``hidden [v,h,w]``."""
+def _describe_hidden(scene: PicturedScene, hidden: np.ndarray, views: Sequence[int]) -> str:
+    """Say in which photos of ``views`` something covers the scene, at the pixels ``hidden [v,h,w]``; "" for none."""
     with_hidden = [view for view in views if hidden[view].any()]
-    max_percent = 100 * max((float(hidden[view].mean()) for view in with_hidden), default=0)
-    noted_percent = 1  # there is no note if no photo is covered by at least this percentage
-    if max_percent < noted_percent:
-        return
-    note(
+    if not with_hidden:
+        return ""
+    max_percent = 100 * max(float(hidden[view].mean()) for view in with_hidden)
+    return (
         f"{len(with_hidden)} of {len(views)} photos differ in part from their Gaussians"
-        f" (up to {max_percent:.0f} % of a photo; perhaps a mask, a mark, a finger, another look or camera):"
-        " the Gaussians' colours are used there, with"
-        f" --set look=scene everywhere: {list_some([scene.names[view] for view in with_hidden])}"
+        f" (up to {max_percent:.2g} % of a photo; perhaps a mask, a mark, a finger, another look or camera):"
+        f" the Gaussians' colours are used there ({list_some([scene.names[view] for view in with_hidden])};"
+        " --set look=scene uses them everywhere)"
     )
 
 

@@ -71,7 +71,10 @@ def select(*names: str) -> tuple[Step, ...]:
 
 
 def without(*names: str) -> tuple[Step, ...]:
-    """Return all steps but those of these names."""
+    """Return all steps but those of these names; ValueError if there is no step of a name."""
+    unknown = sorted(set(names) - {step.name for step in STEPS})
+    if unknown:
+        raise ValueError(f"expected steps among {', '.join(step.name for step in STEPS)}, got {', '.join(unknown)}")
     return tuple(step for step in STEPS if step.name not in names)
 
 
@@ -128,7 +131,7 @@ def use_photos(p: Prepared, options: PrepareOptions) -> Prepared:
     if not views:
         return p
     reference = Reference(PHOTOS, views, photo_files=p.reference.photo_files)
-    return p.after("; ".join(changes), scene=scene, reference=reference)
+    return p.after(*changes, scene=scene, reference=reference)
 
 
 def use_row_colors(p: Prepared, _: PrepareOptions) -> Prepared:
@@ -216,12 +219,14 @@ def fill_scene(p: Prepared, options: PrepareOptions) -> Prepared:
     filled = fill_holes(p.scene, shown, everywhere=options.extent == "photos")
     scene = draw_left_out(replace(filled, depths=None), masks)
     count = len(scene.gaussians) - len(p.scene.gaussians)
-    changes = [f"{count_words(count, 'Gaussian')} added at pixels that no Gaussian covered enough"] if count else []
+    added = f"{count_words(count, 'Gaussian')} added at pixels that no Gaussian covered enough" if count else ""
+    drawn = ""
     num_changed = _count_changed(p.scene.images, scene.images)
     if num_changed:
-        where = f"in {num_changed} of {len(scene)} pictures, pixels at which photos do not count"
-        changes.append(f"{where} show the Gaussians, or nothing")
-    return p.after("; ".join(changes), scene=scene)
+        share = 100 * (p.scene.images != scene.images).any(-1).mean()
+        where = f"{num_changed} of {len(scene)} pictures, where photos do not count ({share:.1f} % of all pixels)"
+        drawn = f"the Gaussians, or nothing, drawn in {where}"
+    return p.after(added, drawn, scene=scene)
 
 
 def score_shown_views(p: Prepared, _: PrepareOptions) -> Prepared:

@@ -54,13 +54,13 @@ class Prepared:
     agreement: Agreement | None = None  # Shares of depth that views confirm; None if views cannot be compared
     changes: tuple[str, ...] = ()  # What was done to photos, cameras and Gaussians, a sentence for each step
 
-    def after(self, change: str, *, scene: Scene, **facts: Any) -> Prepared:
-        """Return a copy with another scene and other facts after a step; ``change`` says what it did, "" for nothing.
+    def after(self, *changes: str, scene: Scene, **facts: Any) -> Prepared:
+        """Return a copy with another scene and other facts after a step; ``changes`` say what it did, "" for nothing.
 
         Until the pictures are chosen, a scene may have none.
         """
-        changes = (*self.changes, change) if change else self.changes
-        return replace(self, scene=cast("PicturedScene", scene), changes=changes, **facts)
+        said = (*self.changes, *filter(None, changes))
+        return replace(self, scene=cast("PicturedScene", scene), changes=said, **facts)
 
     @property
     def size(self) -> SceneSize:

@@ -47,6 +47,12 @@ def test_changes_are_on_the_page_of_a_result(room: Scene) -> None:
     assert f"Changed before merging: {change}." in html.unescape(view(dark, result).text)
 
 
+def test_steps_are_left_out_by_names_that_there_are() -> None:
+    assert len(without("photos", "holes")) == len(STEPS) - 2
+    with pytest.raises(ValueError, match="foto"):
+        without("foto")
+
+
 def test_fewer_steps_do_less(room: Scene) -> None:
     bare = replace(room, pixels=None, images=None)
     assert prepare(bare, steps=select("frame")).scene.pixels is None
