@@ -24,6 +24,7 @@ from gsmerge.prepare.draw_left_out import draw_left_out, mask_background
 from gsmerge.prepare.draw_outside import draw_outside
 from gsmerge.prepare.exposure import equalise_exposure
 from gsmerge.prepare.fill_holes import fill_holes
+from gsmerge.prepare.masked_rows import drop_masked, find_covered
 from gsmerge.prepare.move_poses import move_poses
 from gsmerge.prepare.repeats import without_repeats
 from gsmerge.prepare.row_colors import add_row_colors
@@ -109,6 +110,15 @@ def raise_tiny_sizes(p: Prepared, _: PrepareOptions) -> Prepared:
     """Raise the sizes of Gaussians that the low-pass hides."""
     scene, change = raise_sizes(p.scene, placed=p.reference.placed)
     return p.after(change, scene=scene)
+
+
+def drop_masked_rows(p: Prepared, _: PrepareOptions) -> Prepared:
+    """Leave out the Gaussians of masked pixels that other views contradict."""
+    scene, foreign, change = drop_masked(p.scene)
+    covered = find_covered(scene)
+    if foreign is not None and covered is not None:
+        covered |= foreign
+    return _leave_out(p, scene, foreign if covered is None else covered, change)
 
 
 def leave_out_background(p: Prepared, options: PrepareOptions) -> Prepared:
@@ -216,6 +226,8 @@ def fill_scene(p: Prepared, options: PrepareOptions) -> Prepared:
     shown = np.zeros(p.scene.images.shape[:3], bool)
     has_row_colors = p.reference.name == ROW_COLORS  # these pictures have colours at all pixels
     shown[views] = True if has_row_colors or masks is None else masks[views]
+    if p.foreign is not None:
+        shown |= p.foreign  # what no other view sees there is filled from beside
     filled = fill_holes(p.scene, shown, everywhere=options.extent == "photos")
     scene = draw_left_out(replace(filled, depths=None), masks)
     count = len(scene.gaussians) - len(p.scene.gaussians)
@@ -261,6 +273,7 @@ STEPS: tuple[Step, ...] = (
     Step("frame", enter_frame),
     Step("pixels", lambda p, _: p.after("", scene=with_pixels(p.scene))),
     Step("sizes", raise_tiny_sizes),
+    Step("masked rows", drop_masked_rows),
     Step("background", leave_out_background),
     Step("photos", use_photos),
     Step("row colours", use_row_colors),
@@ -274,6 +287,20 @@ STEPS: tuple[Step, ...] = (
     Step("scored views", score_shown_views),
     Step("outside", draw_unseen),
 )
+
+
+def _leave_out(p: Prepared, scene: Scene, foreign: np.ndarray | None, change: str) -> Prepared:
+    """Return a scene from which Gaussians were left out; in a fit, the pixels ``foreign [v,h,w]`` weigh nothing.
+
+    With a smaller weight than usual, a fit would learn there what the input shows without these Gaussians.
+    """
+    if foreign is None:
+        return p
+    importance = np.ones(foreign.shape, np.float32) if scene.importance is None else scene.importance.copy()
+    importance[foreign] = 0
+    if p.foreign is not None:
+        foreign = foreign | p.foreign
+    return p.after(change, scene=with_pixels(replace(scene, importance=importance)), foreign=foreign)
 
 
 def _without_photos(p: Prepared) -> Scene:

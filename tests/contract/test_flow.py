@@ -66,7 +66,7 @@ def test_no_code_beyond_io_asks_for_the_kind_of_a_scene() -> None:
 
 
 def test_prepared_facts_are_few() -> None:
-    assert len(fields(Prepared)) <= 8
+    assert len(fields(Prepared)) <= 9
 
 
 def test_prepared_facts_hold_no_options() -> None:

@@ -52,6 +52,8 @@ class Prepared:
     repeated: tuple[int, ...]  # Index in the canonical scene of every view of the input scene
     moved: bool  # True if views were moved to poses at which their photos agree, before a fit or by it
     agreement: Agreement | None = None  # Shares of depth that views confirm; None if views cannot be compared
+    # [v,h,w] bool, pixels of which photos and Gaussians are no part of the scene; None if there are none
+    foreign: np.ndarray | None = None
     changes: tuple[str, ...] = ()  # What was done to photos, cameras and Gaussians, a sentence for each step
 
     def after(self, *changes: str, scene: Scene, **facts: Any) -> Prepared:
