@@ -26,6 +26,7 @@ from gsmerge.prepare.exposure import equalise_exposure
 from gsmerge.prepare.fill_holes import fill_holes
 from gsmerge.prepare.masked_rows import drop_masked, find_covered
 from gsmerge.prepare.move_poses import move_poses
+from gsmerge.prepare.overlays import leave_out_overlays
 from gsmerge.prepare.repeats import without_repeats
 from gsmerge.prepare.row_colors import add_row_colors
 from gsmerge.prepare.true_pixels import raise_sizes, with_pixels
@@ -119,6 +120,13 @@ def drop_masked_rows(p: Prepared, _: PrepareOptions) -> Prepared:
     if foreign is not None and covered is not None:
         covered |= foreign
     return _leave_out(p, scene, foreign if covered is None else covered, change)
+
+
+def drop_overlays(p: Prepared, options: PrepareOptions) -> Prepared:
+    """Leave out what all photos show at the same pixels, and its Gaussians."""
+    if p.scene.images is None or options.look != "auto":
+        return p
+    return _leave_out(p, *leave_out_overlays(PicturedScene.with_pictures(p.scene, p.scene.images, p.scene.masks)))
 
 
 def leave_out_background(p: Prepared, options: PrepareOptions) -> Prepared:
@@ -274,6 +282,7 @@ STEPS: tuple[Step, ...] = (
     Step("pixels", lambda p, _: p.after("", scene=with_pixels(p.scene))),
     Step("sizes", raise_tiny_sizes),
     Step("masked rows", drop_masked_rows),
+    Step("overlays", drop_overlays),
     Step("background", leave_out_background),
     Step("photos", use_photos),
     Step("row colours", use_row_colors),
