@@ -22,6 +22,7 @@ from gsmerge.prepare.compare_photos import compare_photos
 from gsmerge.prepare.confirm_depths import confirm_depths
 from gsmerge.prepare.draw_left_out import draw_left_out, mask_background
 from gsmerge.prepare.draw_outside import draw_outside
+from gsmerge.prepare.edits import follow_edits
 from gsmerge.prepare.exposure import equalise_exposure
 from gsmerge.prepare.fill_holes import fill_holes
 from gsmerge.prepare.masked_rows import drop_masked, find_covered
@@ -120,6 +121,14 @@ def drop_masked_rows(p: Prepared, _: PrepareOptions) -> Prepared:
     if foreign is not None and covered is not None:
         covered |= foreign
     return _leave_out(p, scene, foreign if covered is None else covered, change)
+
+
+def follow_scene_edits(p: Prepared, options: PrepareOptions) -> Prepared:
+    """Let photos follow what was edited in the scene after they were taken."""
+    if p.reference.placed or options.look != "auto":
+        return p
+    scene, change = follow_edits(p.scene)
+    return p.after(change, scene=scene) if change else p
 
 
 def drop_overlays(p: Prepared, options: PrepareOptions) -> Prepared:
@@ -282,6 +291,7 @@ STEPS: tuple[Step, ...] = (
     Step("pixels", lambda p, _: p.after("", scene=with_pixels(p.scene))),
     Step("sizes", raise_tiny_sizes),
     Step("masked rows", drop_masked_rows),
+    Step("edits", follow_scene_edits),
     Step("overlays", drop_overlays),
     Step("background", leave_out_background),
     Step("photos", use_photos),
