@@ -28,6 +28,7 @@ from gsmerge.prepare.fill_holes import fill_holes
 from gsmerge.prepare.masked_rows import drop_masked, find_covered
 from gsmerge.prepare.move_poses import move_poses
 from gsmerge.prepare.overlays import leave_out_overlays
+from gsmerge.prepare.passers_by import leave_out_passers
 from gsmerge.prepare.repeats import without_repeats
 from gsmerge.prepare.row_colors import add_row_colors
 from gsmerge.prepare.true_pixels import raise_sizes, with_pixels
@@ -136,6 +137,11 @@ def drop_overlays(p: Prepared, options: PrepareOptions) -> Prepared:
     if p.scene.images is None or options.look != "auto":
         return p
     return _leave_out(p, *leave_out_overlays(PicturedScene.with_pictures(p.scene, p.scene.images, p.scene.masks)))
+
+
+def drop_passers_by(p: Prepared, options: PrepareOptions) -> Prepared:
+    """Leave out what only one photo shows, and its Gaussians."""
+    return p if p.reference.placed or options.look != "auto" else _leave_out(p, *leave_out_passers(p.scene))
 
 
 def leave_out_background(p: Prepared, options: PrepareOptions) -> Prepared:
@@ -293,6 +299,7 @@ STEPS: tuple[Step, ...] = (
     Step("masked rows", drop_masked_rows),
     Step("edits", follow_scene_edits),
     Step("overlays", drop_overlays),
+    Step("passers-by", drop_passers_by),
     Step("background", leave_out_background),
     Step("photos", use_photos),
     Step("row colours", use_row_colors),
