@@ -25,7 +25,7 @@ from gsmerge.plan.counts import describe_share
 from gsmerge.prepare.confirm_depths import confirm_depths
 from gsmerge.prepare.prepare_scene import views_notes
 from gsmerge.prepare.repeats import without_repeats
-from gsmerge.prepare.steps import begin, select, take_steps
+from gsmerge.prepare.steps import RULES, begin, select, take_steps
 from gsmerge.reading.alignment import check_cameras
 from gsmerge.reading.candidates import read_scene_cameras
 from gsmerge.reading.choice import candidate_lines
@@ -176,7 +176,7 @@ def _describe_scene(load: Loaded, *, is_result: bool) -> dict[str, Any]:
     names = ("finite", "views", "frame", "sizes")
     with record_part(silent=True) as record:
         if len(distinct.gaussians) > 0:
-            steps = select(*names, "pixels", "background", "photos") if len(distinct) else select(*names)
+            steps = select(*names, "pixels", *RULES, "background", "photos") if len(distinct) else select(*names)
             prepared = take_steps(steps, begin(distinct))
             canonical = prepared.scene
             changes = prepared.changes

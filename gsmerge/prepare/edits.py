@@ -40,8 +40,9 @@ LEAST_PART = 0.003  # least share of a picture that an edit covers; smaller part
 # Least distance of a moved Gaussian from its own pixel, in longer sides of a picture. Within it, Gaussians lie beside
 # their pixels because poses or lenses are inexact
 MOVED = 0.01
-# Largest share of Gaussians that were moved, or of pixels without Gaussians. If more are, Gaussians are stored in
-# another order than their pixels, or the exporter left out what it was not sure of
+# Largest share of Gaussians that were moved or have new colours, or of pixels without Gaussians. If more are, Gaussians
+# are stored in another order than their pixels, photos have another tone or look, or the exporter left out what it was
+# not sure of
 MOST_EDITED = 0.3
 COMPACT = 0.6  # least share of a view's pixels without Gaussians in one part; exporters leave out pixels everywhere
 SQUARE_3 = np.ones((3, 3), np.uint8)
@@ -60,6 +61,8 @@ def follow_edits(scene: Scene) -> tuple[Scene, str]:
     step = 1 + len(scene.gaussians) * len(views) // MOST_PAIRS
     rows = np.arange(0, len(scene.gaussians), step)
     edited = _find_moved(pictured, rows) if scene.has_own_pixels else _find_new_colors(pictured, rows)
+    if edited.mean() > MOST_EDITED:
+        return scene, ""
     shares = _measure_shares(pictured, rows, edited)
     is_dense = 2 * sum(_find_large(share > DENSE).any() for share in shares) >= len(views)
     left = np.zeros(scene.images.shape[:3], bool)  # pixels whose own Gaussians are gone

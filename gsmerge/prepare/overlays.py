@@ -1,9 +1,9 @@
 """Scene with photos -> the scene without what all photos show at the same pixels: logos, letters, borders, a bonnet.
 
 Another photo predicts the pixels of a photo in two ways: by its own pixel at the same place, and by the pixel at which
-its view sees the Gaussian of the first one. Of a scene the second is right, or both are alike, as in a plain sky. Of an
-overlay the first is right, in every photo. Values that are compared are colours and slopes of brightness, since a half
-transparent mark has its own slopes, but no colour of its own.
+its view sees the Gaussian of the first one, as it lies or as far as sky. Of a scene the second is right, or both are
+alike, as in a plain sky. Of an overlay the first is right, in every photo. Values that are compared are colours and
+slopes of brightness, since a half transparent mark has its own slopes, but no colour of its own.
 """
 
 from __future__ import annotations
@@ -36,7 +36,9 @@ PURE = 0.95
 LEAST_PAIRS = 0.25
 LEAST_SEEDS = 0.006  # least share of seeds in a picture; sound captures have up to .0005
 OUTLINE = 0.5  # least share of a part's outline with an edge that photos share, and with seeds; sound parts have 0
-FAR = 4.0  # depth, in medians of the view, from which on a plain part is sky
+FAR = 2.0  # depth, in medians of the view, from which on a plain part may be sky, whose depth models guess
+MOST_SHARE = 0.5  # most pixels of a picture that an overlay covers; if more are alike, photos show no scene
+FAR_AWAY = 1000.0  # multiple of a Gaussian's distance at which it would be as sky, which has no parallax
 MOST_BARE = 0.5  # most pixels of a part without a Gaussian, else it is the background of a cut-out object
 LEAST_PART_SEEDS = 8  # fewest seeds of a part, small pixels
 STROKE = 16  # gaps of a mark up to this size are filled, small pixels
@@ -123,7 +125,7 @@ def find_overlay(scene: PicturedScene) -> np.ndarray | None:
         is_outlined = outline.any() and min(near_edge[outline].mean(), near_seed[outline].mean()) >= OUTLINE
         if is_outlined and not is_sky and has_row[inside].mean() >= 1 - MOST_BARE:
             part |= inside
-    if (seeds & part).mean() < LEAST_SEEDS:
+    if (seeds & part).mean() < LEAST_SEEDS or part.mean() > MOST_SHARE:
         return None
     weak_edges = _find_edges(slopes, usual_slopes, by_slope.noise / 2)
     return _grow_letters(part, weak_edges & ~(by_color.denied | by_slope.denied))
@@ -144,16 +146,20 @@ def _vote(scene: PicturedScene, views: Sequence[int], values: np.ndarray, *, ste
         rows = scene.get_pixels().fronts[view][lines, columns]
         others = [(number + offset) % count for offset in offsets]
         cameras = scene.cameras[[views[i] for i in others]]
-        places, depths = project(scene.gaussians.means[np.maximum(rows, 0)].reshape(-1, 3), cameras)
+        eye = scene.cameras.centres[view]
+        means = scene.gaussians.means[np.maximum(rows, 0)].reshape(-1, 3).astype(np.float64)
+        places, depths = project(np.concatenate([means, eye + FAR_AWAY * (means - eye)]), cameras)
         own = values[number, ::step, ::step]
         for other, place, depth in zip(others, places, depths, strict=True):
             with np.errstate(invalid="ignore"):
-                u, v = (place / scale - 0.5).astype(np.float32).reshape(*x.shape, 2).transpose(2, 0, 1)
-                inside = (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1) & (depth.reshape(x.shape) > 0)
+                u, v = (place / scale - 0.5).astype(np.float32).reshape(2, *x.shape, 2).transpose(3, 0, 1, 2)
+                inside = (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1) & (depth.reshape(u.shape) > 0)
             u = np.where(inside, u, 0)
             v = np.where(inside, v, 0)
-            tells.append(inside & (rows >= 0) & (np.abs(u - x) + np.abs(v - y) > MOVED))
-            by_rows.append(np.abs(own - sample_bilinear(values[other], u, v)).mean(-1))
+            moved = inside & (np.abs(u - x) + np.abs(v - y) > MOVED)
+            near_error, far_error = np.abs(own - sample_bilinear(values[other], u, v)).mean(-1)
+            tells.append(moved[0] & (rows >= 0))
+            by_rows.append(np.where(moved[1], np.minimum(near_error, far_error), near_error))
             by_pixel.append(np.abs(own - values[other, ::step, ::step]).mean(-1))
     told = np.stack(tells)
     row_errors = np.stack(by_rows)

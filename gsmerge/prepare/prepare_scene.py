@@ -11,7 +11,7 @@ from gsmerge.method.geometry.frame import Frame
 from gsmerge.method.viewpoints.place_cameras import NO_VIEWS, VIEWER_VIEWS, place_inside
 from gsmerge.prepare.repeats import without_repeats
 from gsmerge.prepare.row_colors import NO_PHOTOS
-from gsmerge.prepare.steps import STEPS, Step, begin, has_changed, select, take_steps
+from gsmerge.prepare.steps import RULES, STEPS, Step, begin, has_changed, select, take_steps
 from gsmerge.runtime.record import record_choices, record_part, stage
 from gsmerge.settings.stages import PrepareOptions
 from gsmerge.types import Scene
@@ -54,7 +54,7 @@ def scored_pictures(scene: Scene) -> tuple[Scene, bool]:
     if len(scene) == 0 or len(scene.gaussians) == 0 or not has_pictures:
         return scene, False
     with record_part(silent=True):
-        given = take_steps(select("frame", "pixels", "background"), begin(scene))
+        given = take_steps(select("frame", "pixels", *RULES, "background"), begin(scene))
         prepared = take_steps(select("photos", "row colours"), given)
         if prepared.reference.name == ROW_COLORS:
             return replace(scene, images=prepared.scene.images, masks=prepared.scene.masks), False

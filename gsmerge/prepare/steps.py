@@ -289,6 +289,8 @@ def draw_unseen(p: Prepared, _: PrepareOptions) -> Prepared:
     return p.after(change, scene=drawn, reference=reference)
 
 
+# Names of the steps that leave out, or follow, what people did to photos, masks and scenes
+RULES = ("masked rows", "edits", "overlays", "passers-by")
 STEPS: tuple[Step, ...] = (
     Step("repeats", drop_repeats),
     Step("finite", drop_nonfinite),
