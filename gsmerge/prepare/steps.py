@@ -116,7 +116,9 @@ def raise_tiny_sizes(p: Prepared, _: PrepareOptions) -> Prepared:
 
 
 def drop_masked_rows(p: Prepared, _: PrepareOptions) -> Prepared:
-    """Leave out the Gaussians of masked pixels that other views contradict."""
+    """Leave out the Gaussians of masked pixels that other views contradict, but not at the border of a crop."""
+    if p.scene.region is not None:
+        return p
     scene, foreign, change = drop_masked(p.scene)
     covered = find_covered(scene)
     if foreign is not None and covered is not None:
