@@ -188,14 +188,15 @@ def _find_deleted(scene: PicturedScene, rows: np.ndarray) -> np.ndarray:
         if (part & bare[view]).sum() < COMPACT * bare[view].sum():
             continue
         deleted[view] = part
+        if part[[0, -1]].any() or part[:, [0, -1]].any():
+            continue
         photo = cv2.resize(scene.images[view], (width, height), interpolation=cv2.INTER_NEAREST).reshape(-1, 3)
         seen, places, _ = _look_up(means, scene, view, width, height)
         distances = np.abs(colors[seen] - photo[places[seen]]).mean(-1)
         least = np.ones(width * height, np.float32)
         np.minimum.at(least, places[seen], distances)
         small = cv2.resize(part.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST).reshape(-1) > 0
-        is_inside = not (part[[0, -1]].any() or part[:, [0, -1]].any())
-        num_sure += bool(is_inside and small.any() and (least[small] > OTHER).mean() > DENSE)
+        num_sure += bool(small.any() and (least[small] > OTHER).mean() > DENSE)
     return deleted if 2 * num_sure > len(scene.photo_views) else np.zeros_like(deleted)
 
 
