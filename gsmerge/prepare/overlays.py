@@ -164,7 +164,10 @@ def _vote(scene: PicturedScene, views: Sequence[int], values: np.ndarray, *, ste
     told = np.stack(tells)
     row_errors = np.stack(by_rows)
     pixel_errors = np.stack(by_pixel)
-    noise = max(1 / 255, float(np.median(row_errors[told])) / 2) if told.any() else 1.0
+    nothing = np.zeros(x.shape, bool)
+    if not told.any() or np.median(row_errors[told]) >= np.median(pixel_errors[told]):
+        return _Votes(nothing, nothing, 1.0)  # photos are too alike, or Gaussians too rough, to tell scene from overlay
+    noise = max(1 / 255, float(np.median(row_errors[told])) / 2)
     is_same = (told & (row_errors > BETTER * pixel_errors + noise)).sum(0)
     is_scene = (told & (pixel_errors > BETTER * row_errors + noise)).sum(0)
     num_told = told.sum(0)
