@@ -34,7 +34,7 @@ class Evidence:
     sight: CameraCheck | None = None  # what its cameras see; None if it was not measured
     num_views: int = 0
     names: tuple[str, ...] = ()  # of its views
-    num_row_views: int = 0  # number of views that the rows form, if they are not the pixels of its views; else 0
+    own_views: int = 0  # number of views that the rows form, if they are not the pixels of its views; else 0
     photo_place: Path | None = None  # folder or file of its photos; None without any
     has_photos: bool = False
     num_shown: int = 0  # number of its views that a photo shows
@@ -67,7 +67,7 @@ def is_needed(candidate: Candidate, tried: Sequence[Evidence]) -> bool:
     files = tried[0].files
     best = choose(tried)
     if best is not None:
-        return best.num_row_views > best.num_views
+        return best.own_views > best.num_views
     photos_are_to_blame = False
     if "images" in files.named:
         photos_are_to_blame = Path(find_cause(tried).path).is_relative_to(files.images or files.ply)

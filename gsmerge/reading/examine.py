@@ -106,7 +106,7 @@ def _measure(
         sight=sight,
         num_views=len(load.scene),
         names=load.scene.names,
-        num_row_views=load.num_row_views,
+        own_views=load.own_views,
         has_photos=load.scene.images is not None,
         num_shown=len(load.scene.photo_views),
         notes=(*notes_on_way, *load.notes),

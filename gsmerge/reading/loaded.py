@@ -47,7 +47,7 @@ class Loaded:
     source: PhotoSource | None = None  # the photos as stored, until larger photos and masks are read; then None
     sha256: str | None = None  # hash of the files of Gaussians, one after the other; None if it was not asked for
     candidates: tuple[Choice, ...] = ()  # cameras, photos and masks that may belong to the scene, with reasons
-    num_row_views: int = 0  # number of views that the rows form, if the rows are not pixels of the cameras; else 0
+    own_views: int = 0  # number of views that the rows form, if the rows are not pixels of the cameras; else 0
 
     @property
     def doubts(self) -> list[str]:

@@ -128,7 +128,7 @@ def make_scene(ply: GaussianFile, placed: Placed, hints: ReadHints) -> Loaded:
         recovery=recovery,
         problem=result.problem,
         moves=result.moves,
-        num_row_views=result.num_row_views,
+        own_views=result.own_views,
         source=source,
     )
 

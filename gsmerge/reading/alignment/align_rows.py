@@ -117,7 +117,7 @@ class AlignmentResult:
     confirmed_viewmats: np.ndarray | None = None
     problem: str | None = None  # why the rows have no pixels; None if they have
     # Number of views that the rows form on their own, if the rows are pixels, but not of ``cameras``; else 0
-    num_row_views: int = 0
+    own_views: int = 0
     sight: CameraCheck | None = None  # what the cameras see; None if rows have pixels, or if it was not measured
 
 
@@ -331,7 +331,7 @@ def _align_without_pixels(source: RowSource, grid: Grid, frames: Callable[[], Se
         notes=notes,
         transform=grid.transform,
         problem=no_pixels.problem,
-        num_row_views=0 if source.order == "none" else len(source.own_cameras or ()),
+        own_views=0 if source.order == "none" else len(source.own_cameras or ()),
         sight=sight,
     )
 

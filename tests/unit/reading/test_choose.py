@@ -123,9 +123,9 @@ def test_only_scenes_that_may_be_chosen_are_kept() -> None:
     ("evidence", "files", "expected"),
     [
         (fits(), {}, False),
-        (fits(num_row_views=3), {}, False),
-        (fits(num_row_views=4), {}, True),
-        (fits(num_row_views=4), {"named": frozenset({"cameras"})}, True),
+        (fits(own_views=3), {}, False),
+        (fits(own_views=4), {}, True),
+        (fits(own_views=4), {"named": frozenset({"cameras"})}, True),
         (fails(), {}, True),
         (fails(), {"named": frozenset({"cameras"})}, False),
         (fails(), {"named": frozenset({"images"})}, True),
@@ -154,7 +154,7 @@ def test_cameras_that_do_not_fit_are_left_out_for_those_of_the_rows() -> None:
 
 
 def test_rows_of_more_views_than_cameras_name_the_views_that_lack_one() -> None:
-    few = fits(num_views=2, names=("0.png", "1.png"), stored=stored("0.png", "1.png"), num_row_views=3)
+    few = fits(num_views=2, names=("0.png", "1.png"), stored=stored("0.png", "1.png"), own_views=3)
     rows = fits(ROWS, notes=(Note("estimated", "estimated cameras"),))
     chosen = choose([few, rows])
     assert chosen is not None
@@ -166,7 +166,7 @@ def test_rows_of_more_views_than_cameras_name_the_views_that_lack_one() -> None:
 
 def test_photos_that_the_caller_named_are_not_given_up() -> None:
     named = frozenset({"images"})
-    best = with_files(fits(num_views=2, num_row_views=3, has_photos=True, stored=stored("0.png", "1.png")), named=named)
+    best = with_files(fits(num_views=2, own_views=3, has_photos=True, stored=stored("0.png", "1.png")), named=named)
     rows = with_files(fits(ROWS), named=named)
     assert choose([best, rows]) is best
     chosen = choose([best, replace(rows, has_photos=True)])
@@ -271,7 +271,7 @@ def test_every_candidate_has_a_reason_and_an_option() -> None:
         ([fits(sight=SEES_HALF), fits(CAMERAS[1], are_pixels=True, share_near=1.0)], 1,
          [(False, "see 50 % of the Gaussians, but no photo shows that they fit"),
           (True, "100.0 % of the Gaussians lie near their pixels")]),
-        ([fits(num_row_views=4, sight=SEES_HALF), fits(ROWS, num_views=4, share_near=1.0, stored=ESTIMATED_CAMERAS)], 1,
+        ([fits(own_views=4, sight=SEES_HALF), fits(ROWS, num_views=4, share_near=1.0, stored=ESTIMATED_CAMERAS)], 1,
          [(False, "see 50 % of the Gaussians, but they are 3, and the Gaussians form 4 views"),
           (False, "not examined, since others fit"),
           (True, "the Gaussians form 4 views: 100.0 % of the Gaussians lie near their pixels")]),
