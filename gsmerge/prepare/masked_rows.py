@@ -7,6 +7,8 @@ through these Gaussians, or they see another colour at their place.
 
 from __future__ import annotations
 
+from itertools import combinations
+
 import cv2
 import numpy as np
 
@@ -48,36 +50,54 @@ def drop_masked(scene: Scene) -> tuple[Scene, np.ndarray | None, str]:
     """Drop the Gaussians of masked parts that other views contradict.
 
     Each Gaussian belongs to a view; of Gaussians that views share, nothing is dropped. Also returns the pixels
-    ``[v,h,w]`` bool of these parts, None if there are none, and a sentence about them.
+    ``[v,h,w]`` bool of these parts and of those that :func:`find_covered` finds, None if there are none, and a sentence
+    about the Gaussians that were dropped.
     """
-    if scene.masks is None or scene.masks.all() or not scene.has_own_pixels or len(scene) < LEAST_VIEWS:
+    if scene.masks is None or scene.masks.all() or not scene.has_own_pixels:
         return scene, None, ""
+    foreign = find_denied(scene)
+    goes = foreign.reshape(-1)[scene.get_pixels().homes]
+    change = ""
+    if goes.any():
+        share = f"{100 * goes.mean():.1f} % of the Gaussians"
+        change = f"{share} belong to masked pixels at which other views see something else: left out"
+        scene = take_rows(scene, np.flatnonzero(~goes))
+    covered = find_covered(scene)
+    if covered is not None:
+        foreign |= covered
+    return scene, foreign if foreign.any() else None, change
+
+
+def find_denied(scene: Scene) -> np.ndarray:
+    """Find the pixels ``[v,h,w]`` bool of masked parts whose Gaussians other views contradict."""
+    labels = np.zeros(counting_pixels(scene).shape, np.int32)  # of the part of a mask at each pixel, from 1; else 0
+    if len(scene) < LEAST_VIEWS:
+        return labels > 0
     answers = parallel_map(lambda view: _ask_others(scene, view), range(len(scene)))
     num_seen = sum(int((a.seen & a.counts).sum()) for a in answers)
     num_denied = sum(int((a.denied & a.counts).sum()) for a in answers)
     most_denied = max(LEAST_SHARE, MORE * num_denied / max(1, num_seen))
-    parts = list[tuple[int, np.ndarray]]()  # the view of a part of a mask, and its pixels
-    tallies = list[np.ndarray]()  # of each part, how many sampled Gaussians others see, and how many of these they deny
-    for view, answer in enumerate(answers):
-        number, labels = cv2.connectedComponents((~scene.masks[view]).astype(np.uint8), connectivity=8)
-        label_of = labels.reshape(-1)[answer.pixels]
-        for label in range(1, number):
-            seen = answer.seen & (label_of == label)
-            parts.append((view, labels == label))
-            tallies.append(np.array([seen.sum(), (seen & answer.denied).sum()]))
-    foreign = np.zeros(scene.masks.shape, bool)
-    for view, part in parts:
-        # a part at the same pixels of several photos is one thing, such as the bonnet of a car
-        same = [tally for (_, other), tally in zip(parts, tallies, strict=True) if _share_pixels(part, other)]
-        seen_count, denied_count = np.sum(same, 0)
-        if seen_count >= LEAST_SEEN and denied_count > most_denied * seen_count:
-            foreign[view] |= part
-    if not foreign.any():
-        return scene, None, ""
-    goes = foreign.reshape(-1)[scene.get_pixels().homes]
-    share = f"{100 * goes.mean():.1f} % of the Gaussians"
-    change = f"{share} belong to masked pixels at which other views see something else: left out"
-    return take_rows(scene, np.flatnonzero(~goes)), foreign, change
+    number = 1
+    for view, counts in enumerate(counting_pixels(scene)):
+        count, parts = cv2.connectedComponents((~counts).astype(np.uint8), connectivity=8)
+        labels[view] = np.where(parts > 0, parts + number - 1, 0)
+        number += count - 1
+    sizes = np.bincount(labels.reshape(-1), minlength=number)
+    label_of = [labels[view].reshape(-1)[a.pixels] for view, a in enumerate(answers)]
+    seen = np.bincount(np.concatenate([of[a.seen] for of, a in zip(label_of, answers, strict=True)]), minlength=number)
+    denied = np.concatenate([of[a.seen & a.denied] for of, a in zip(label_of, answers, strict=True)])
+    tallies = np.stack([seen, np.bincount(denied, minlength=number)], 1)
+    totals = tallies.copy()
+    # parts with most of their pixels in common in several photos are one thing, such as the bonnet of a car
+    for first, second in combinations(labels, 2):
+        both = (first > 0) & (second > 0)
+        pairs, common = np.unique(np.stack([first[both], second[both]]), axis=1, return_counts=True)
+        one, other = pairs[:, 2 * common > sizes[pairs].sum(0) - common]
+        np.add.at(totals, one, tallies[other])
+        np.add.at(totals, other, tallies[one])
+    goes = (totals[:, 0] >= LEAST_SEEN) & (totals[:, 1] > most_denied * totals[:, 0])
+    goes[0] = False  # pixels that count
+    return np.asarray(goes[labels])
 
 
 def find_covered(scene: Scene) -> np.ndarray | None:
@@ -104,11 +124,6 @@ def find_covered(scene: Scene) -> np.ndarray | None:
 
     tile_views(scene, cover, np.flatnonzero(hidden.any((1, 2))).tolist())
     return covered if covered.any() else None
-
-
-def _share_pixels(first: np.ndarray, second: np.ndarray) -> bool:
-    """Return whether two parts ``[h,w]`` of masks have most of their pixels in common."""
-    return bool(2 * np.count_nonzero(first & second) > np.count_nonzero(first | second))
 
 
 def _ask_others(scene: Scene, view: int) -> _Answers:

@@ -25,7 +25,7 @@ from gsmerge.prepare.draw_outside import draw_outside
 from gsmerge.prepare.edits import follow_edits
 from gsmerge.prepare.exposure import equalise_exposure
 from gsmerge.prepare.fill_holes import fill_holes
-from gsmerge.prepare.masked_rows import drop_masked, find_covered
+from gsmerge.prepare.masked_rows import drop_masked
 from gsmerge.prepare.move_poses import move_poses
 from gsmerge.prepare.overlays import leave_out_overlays
 from gsmerge.prepare.passers_by import leave_out_passers
@@ -119,11 +119,7 @@ def drop_masked_rows(p: Prepared, _: PrepareOptions) -> Prepared:
     """Leave out the Gaussians of masked pixels that other views contradict, but not at the border of a crop."""
     if p.scene.region is not None:
         return p
-    scene, foreign, change = drop_masked(p.scene)
-    covered = find_covered(scene)
-    if foreign is not None and covered is not None:
-        covered |= foreign
-    return _leave_out(p, scene, foreign if covered is None else covered, change)
+    return _leave_out(p, *drop_masked(p.scene))
 
 
 def follow_scene_edits(p: Prepared, options: PrepareOptions) -> Prepared:

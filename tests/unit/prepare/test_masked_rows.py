@@ -53,6 +53,16 @@ def test_what_a_mask_hides_leaves_the_scene_where_others_see_through_it(room: Sc
     assert f"{100 * foreign.mean():.1f} % of the Gaussians" in change
 
 
+def test_of_two_parts_of_a_mask_the_one_goes_that_others_deny(room: Scene) -> None:
+    scene = with_passer_by(room, 1)
+    alone = ~scene.masks
+    masks = scene.masks.copy()
+    masks[1, 26:32, 4:14] = False
+    masks[1, 2:6:2, 2:40:2] = False  # and of many small ones none
+    _, foreign, _ = drop_masked(replace(scene, masks=masks))
+    assert np.array_equal(foreign, alone)
+
+
 def test_a_sound_surface_behind_a_mask_stays(room: Scene) -> None:
     scene = masked(room, (0, 1, 2))
     assert drop_masked(scene) == (scene, None, "")
