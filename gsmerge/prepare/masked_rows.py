@@ -74,19 +74,18 @@ def find_denied(scene: Scene) -> np.ndarray:
     if len(scene) < LEAST_VIEWS:
         return labels > 0
     answers = parallel_map(lambda view: _ask_others(scene, view), range(len(scene)))
-    num_seen = sum(int((a.seen & a.counts).sum()) for a in answers)
-    num_denied = sum(int((a.denied & a.counts).sum()) for a in answers)
-    most_denied = max(LEAST_SHARE, MORE * num_denied / max(1, num_seen))
+    counts, seen, denied = (
+        np.concatenate([getattr(answer, name) for answer in answers]) for name in ("counts", "seen", "denied")
+    )
+    most_denied = max(LEAST_SHARE, MORE * (denied & counts).sum() / max(1, (seen & counts).sum()))
     number = 1
-    for view, counts in enumerate(counting_pixels(scene)):
-        count, parts = cv2.connectedComponents((~counts).astype(np.uint8), connectivity=8)
+    for view, mask in enumerate(counting_pixels(scene)):
+        count, parts = cv2.connectedComponents((~mask).astype(np.uint8), connectivity=8)
         labels[view] = np.where(parts > 0, parts + number - 1, 0)
         number += count - 1
     sizes = np.bincount(labels.reshape(-1), minlength=number)
-    label_of = [labels[view].reshape(-1)[a.pixels] for view, a in enumerate(answers)]
-    seen = np.bincount(np.concatenate([of[a.seen] for of, a in zip(label_of, answers, strict=True)]), minlength=number)
-    denied = np.concatenate([of[a.seen & a.denied] for of, a in zip(label_of, answers, strict=True)])
-    tallies = np.stack([seen, np.bincount(denied, minlength=number)], 1)
+    label_of = np.concatenate([labels[view].reshape(-1)[a.pixels] for view, a in enumerate(answers)])
+    tallies = np.stack([np.bincount(label_of[some], minlength=number) for some in (seen, denied)], 1)
     totals = tallies.copy()
     # parts with most of their pixels in common in several photos are one thing, such as the bonnet of a car
     for first, second in combinations(labels, 2):

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 
 from gsmerge.frozen import dataclass, replace
+from gsmerge.method.compare.view_pictures import fit_size
 from gsmerge.method.geometry.transforms import project
 from gsmerge.method.geometry.views import even_views, take_rows
 from gsmerge.method.kernels.pictures import blur, sample_bilinear, sobel
@@ -89,9 +90,7 @@ def find_overlay(scene: PicturedScene) -> np.ndarray | None:
     """Find the pixels ``[h,w]`` bool of small photos at which all photos show an overlay; None if there is none."""
     views = scene.photo_views
     views = [views[i] for i in even_views(len(views), min(len(views), MOST_VIEWS))]
-    height, width = scene.images.shape[1:3]
-    zoom = min(1.0, SIDE / max(height, width))
-    size = max(1, round(width * zoom)), max(1, round(height * zoom))
+    size = fit_size((scene.cameras.width, scene.cameras.height), SIDE)
     photos = np.stack([cv2.resize(scene.images[view], size, interpolation=cv2.INTER_AREA) for view in views])
     first = _vote(scene, views, photos, step=2, partners=QUICK_PARTNERS)
     slopes = np.stack([np.stack(sobel(photo.mean(-1)), -1) / 8 for photo in photos])

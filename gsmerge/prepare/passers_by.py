@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from gsmerge.frozen import dataclass, replace
+from gsmerge.method.compare.view_pictures import fit_size
 from gsmerge.method.geometry.transforms import camera_depths, median, nearest_views, project
 from gsmerge.method.geometry.views import even_views, resize_cameras, take_rows
 from gsmerge.method.raster.photos import counting_pixels
@@ -95,9 +96,7 @@ def _find_parts(scene: PicturedScene, views: Sequence[int]) -> dict[int, np.ndar
 def _shrink(scene: PicturedScene, view: int) -> SmallView:
     """Return a view with a small photo, whose pixels have the Gaussians of the pixels at their centres."""
     cameras = scene.cameras
-    share = min(1.0, SMALL_SIDE / max(cameras.width, cameras.height))
-    width = max(1, round(cameras.width * share))
-    height = max(1, round(cameras.height * share))
+    width, height = fit_size((cameras.width, cameras.height), SMALL_SIDE)
     columns = (2 * np.arange(width) + 1) * cameras.width // (2 * width)
     lines = (2 * np.arange(height)[:, None] + 1) * cameras.height // (2 * height)
     rows = scene.get_pixels().fronts[view, lines, columns]

@@ -254,11 +254,11 @@ def fill_scene(p: Prepared, options: PrepareOptions) -> Prepared:
     count = len(scene.gaussians) - len(p.scene.gaussians)
     added = f"{count_words(count, 'Gaussian')} added at pixels that no Gaussian covered enough" if count else ""
     drawn = ""
-    num_changed = _count_changed(p.scene.images, scene.images)
-    if num_changed:
-        share = 100 * (p.scene.images != scene.images).any(-1).mean()
-        where = f"{num_changed} of {len(scene)} pictures, where photos do not count ({share:.1f} % of all pixels)"
-        drawn = f"the Gaussians, or nothing, drawn in {where}"
+    if scene.images is not p.scene.images:
+        is_drawn = np.stack([(a != b).any(-1) for a, b in zip(p.scene.images, scene.images, strict=True)])
+        where = f"{is_drawn.any((1, 2)).sum()} of {len(scene)} pictures, where photos do not count"
+        if is_drawn.any():
+            drawn = f"the Gaussians, or nothing, drawn in {where} ({100 * is_drawn.mean():.1f} % of all pixels)"
     return p.after(added, drawn, scene=scene)
 
 
@@ -336,11 +336,6 @@ def _without_photos(p: Prepared) -> Scene:
         importance = importance[[p.repeated.index(view) for view in range(len(p.scene))]]
     bare = PicturedScene.without_pictures(p.scene)
     return replace(bare, large_photos=None, masks=None, importance=importance)
-
-
-def _count_changed(before: np.ndarray, after: np.ndarray) -> int:
-    """Return how many of the pictures ``before [v,h,w,3]`` differ from ``after``; 0 if no new pictures were made."""
-    return 0 if before is after else sum(not np.array_equal(a, b) for a, b in zip(before, after, strict=True))
 
 
 def has_changed(photos: np.ndarray, scene: PicturedScene, views: Sequence[int], repeated: Sequence[int]) -> bool:
