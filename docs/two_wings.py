@@ -62,12 +62,14 @@ def draw_picture() -> str:
     """Return the picture as SVG: a column for each wing, and below both what both use."""
     packages = layers("Imports flow down")
     at = packages.index("method")
+    texts = purposes()
     top, bottom = MARGIN + LINE, [0, 0]
     shapes = [f'<text x="{MARGIN}" y="{MARGIN}">{NOTE}</text>']
     for column, names in enumerate((packages[:at], layers("Imports of the method flow down"))):
         left = MARGIN + column * (WIDTH + APART)
-        bottom[column] = draw_column(shapes, names, list(TITLES)[column], left, top)
-    bottom[1] = draw_column(shapes, packages[at + 1 :], list(TITLES)[2], MARGIN + WIDTH + APART, bottom[1] + LINE)
+        bottom[column] = draw_column(shapes, {name: texts[name] for name in names}, list(TITLES)[column], left, top)
+    shared = {name: texts[name] for name in packages[at + 1 :]}
+    bottom[1] = draw_column(shapes, shared, list(TITLES)[2], MARGIN + WIDTH + APART, bottom[1] + LINE)
     middle = MARGIN + WIDTH + APART / 2
     shapes.append(f'<text x="{middle}" y="{top + 4 * LINE}" text-anchor="middle" font-size="26">→</text>')
     shapes.append(f'<text x="{middle}" y="{top + 5 * LINE}" text-anchor="middle">imports</text>')
@@ -76,12 +78,12 @@ def draw_picture() -> str:
     return "\n".join([head, '<rect width="100%" height="100%" fill="white"/>', *shapes, "</svg>", ""])
 
 
-def draw_column(shapes: list[str], names: list[str], title: str, left: int, top: int) -> int:
-    """Add a title and a box for each name to ``shapes``; return where the column ends, in pixels from the top."""
+def draw_column(shapes: list[str], texts: dict[str, str], title: str, left: int, top: int) -> int:
+    """Add a title, and a box for each name with its text, to ``shapes``; return where the column ends, in pixels."""
     shapes.append(f'<text x="{left}" y="{top + LINE}" font-size="15" font-weight="bold">{escape(title)}</text>')
     top += LINE + 2 * GAP
-    for name in names:
-        lines = list(wrap(name))
+    for name, text in texts.items():
+        lines = list(wrap(name, text))
         height = LINE * len(lines) + GAP
         fill = TITLES[title]
         shapes.append(
@@ -94,9 +96,9 @@ def draw_column(shapes: list[str], names: list[str], title: str, left: int, top:
     return top
 
 
-def wrap(name: str) -> Iterator[str]:
+def wrap(name: str, text: str) -> Iterator[str]:
     """Return the lines of text of a box, of which the first begins behind the name."""
-    first, *rest = textwrap.wrap(f"{name}  {purposes()[name]}", COLUMNS, drop_whitespace=True)
+    first, *rest = textwrap.wrap(f"{name}  {text}", COLUMNS, drop_whitespace=True)
     yield first.removeprefix(name)
     yield from rest
 

@@ -80,6 +80,7 @@ def compact(
         seed=seed, threads=threads,
     )  # fmt: skip
     settings, writing, engine = given.make(*SETTINGS)
+    has_levels = "levels" in given.values
     settings = replace(settings, blocks=replace(settings.blocks, engine=engine))
     # The input may be a .gsm of Feature Gaussians
     states = [path for path in scenes if path.suffix.lower() == STATE_ENDING and path.is_file()]
@@ -106,9 +107,8 @@ def compact(
     if isinstance(source, Path):
         _decode_features(context, source, given, run)
     else:
-        how = opt.read_hints(hint), run
         try:
-            loaded, changes = _compact_files(source, settings, writing, *how, has_levels="levels" in given.values)
+            loaded, changes = _compact_files(source, settings, writing, hint, run, has_levels=has_levels)
         except SceneError as error:
             _print_candidates(error.candidates, run)
             raise
@@ -117,7 +117,7 @@ def compact(
 
 
 def _compact_files(
-    files: "SceneFiles", settings: CompactOptions, writing: FileOptions, reading: opt.Reading, run: Run, *,
+    files: "SceneFiles", settings: CompactOptions, writing: FileOptions, hint: Sequence[str] | None, run: Run, *,
     has_levels: bool,
 ) -> "tuple[Loaded | None, list[str]]":  # fmt: skip
     """Compact a scene; return it as it was read, and what was done to it. With ``--dry-run`` print an estimate instead.
@@ -131,6 +131,7 @@ def _compact_files(
     from gsmerge.results.outputs import name_outputs, settings_for
     from gsmerge.runtime.memory import memory_bytes, memory_problem
 
+    reading = opt.read_hints(hint)
     engine = settings.blocks.engine.engine
     if engine == "ray" and not run.dry_run:
         from gsmerge.runtime.work import require_ray

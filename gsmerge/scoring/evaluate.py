@@ -266,8 +266,9 @@ def evaluate(
         seconds = float(np.median([seconds for seconds, _ in timed_views]))
         views = tuple(view for _, view in timed_views)
         ratio = len(gaussians) / max(len(inputs), 1)
-        counted = name, len(gaussians), ratio
-        scores.append(ResultScores(*counted, seconds, scores=views, fog=fog.get(name, {}), antialiased=marks[name]))
+        scores.append(
+            ResultScores(name, len(gaussians), ratio, seconds, views, fog=fog.get(name, {}), antialiased=marks[name])
+        )
     counts = {name: len(split.scored) for name, split in splits.items()}
     notes = (*lpips_notes, *_describe_scores(splits, scores, mended=mended))
     reference = _describe_references(splits)

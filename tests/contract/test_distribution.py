@@ -131,12 +131,3 @@ def test_the_image_has_the_pinned_versions(root: Path) -> None:
     assert copied >= {*SOURCES, "constraints.txt"}
     assert [name for name in copied if not (root / name).exists()] == []
     assert copied & set((root / ".dockerignore").read_text().split()) == set()
-
-
-def test_git_holds_no_file_that_it_ignores() -> None:
-    """Such as libraries that were built beside their sources."""
-    command = ["git", "ls-files", "-ci", "--exclude-standard"]
-    done = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, check=False)
-    if done.returncode:
-        pytest.skip("no checkout of git")
-    assert done.stdout == ""

@@ -24,6 +24,7 @@ from gsmerge.method.facts.pictures import PHOTOS
 from gsmerge.method.facts.prepared import Prepared, Reference
 from gsmerge.method.geometry.frame import canonicalise
 from gsmerge.method.geometry.transforms import rgb_to_sh0
+from gsmerge.method.kernels.elementary import sin
 from gsmerge.method.pipelines.bare_rows import BARE_ROWS
 from gsmerge.method.pipelines.build import build
 from gsmerge.method.pipelines.pixel_rows import PIXEL_ROWS
@@ -47,7 +48,7 @@ for view in range(VIEWS):
     points = rays * depth[..., None] + [0.1 * view, 0, 0]
     viewmats[view, 0, 3] = -0.1 * view
     means[view] = points
-    images[view] = 0.5 + 0.4 * np.sin(4 * points)
+    images[view] = 0.5 + 0.4 * sin(4 * points)
 num = VIEWS * HEIGHT * WIDTH
 gaussians = Gaussians(
     means=means.reshape(num, 3), quats=np.tile(np.float32([1, 0, 0, 0]), (num, 1)),
