@@ -143,7 +143,7 @@ def share_unexpected(gains: np.ndarray, distances: np.ndarray) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class _Pixels:
+class Surfaces:
     """For each pixel, the centre of the Gaussian in front, and whether the pixel counts."""
 
     cameras: Cameras
@@ -171,20 +171,20 @@ class _Pixels:
         )
 
 
-def _pixels_of(scene: Scene) -> _Pixels:
+def collect_surfaces(scene: Scene) -> Surfaces:
     """Collect the pixels of a scene; pixels without a Gaussian and pixels outside masks do not count."""
     shape = len(scene), scene.pixels_per_view
     fronts = scene.get_pixels().fronts.reshape(shape)
     valid = fronts >= 0
     if scene.masks is not None:
         valid = valid & scene.masks.reshape(shape)
-    return _Pixels(scene.cameras, scene.gaussians.means.take(fronts, axis=0), valid)
+    return Surfaces(scene.cameras, scene.gaussians.means.take(fronts, axis=0), valid)
 
 
 def _measure_pairs(scene: PicturedScene, views: Sequence[int]) -> list[_Pair]:
     """Measure the ratios of colours between pairs of ``views`` that show the same surfaces."""
     size = scene.pixels_per_view
-    pixels = _pixels_of(scene)
+    pixels = collect_surfaces(scene)
     photos = scene.images.reshape(len(scene), size, 3)
     sample = np.random.default_rng(0).permutation(size)[:EXPOSURE_PIXELS]
     partners = choose_partners(camera_distances(scene.cameras[list(views)]))
@@ -246,7 +246,7 @@ def _divide_by_gains(scene: PicturedScene, gains: np.ndarray) -> PicturedScene:
     clipped in all photos, such as a sky, is not masked, because otherwise no photo would show it.
     """
     clipped = ((scene.images >= CLIPPED) & (gains[:, None, None] > BRIGHT_GAIN)).any(-1)
-    pixels, flat = _pixels_of(scene), clipped.reshape(len(scene), -1)
+    pixels, flat = collect_surfaces(scene), clipped.reshape(len(scene), -1)
     order = order_others(camera_distances(scene.cameras))[:, :CLIPPED_NEIGHBOURS]
 
     def find_shown(view: int) -> np.ndarray:

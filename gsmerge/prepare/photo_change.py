@@ -17,19 +17,23 @@ CLIPPED = 0.985  # a pixel may be clipped from this level on
 
 @dataclass(frozen=True, eq=False)
 class PhotoChange:
-    """Changes of one photo: a new value for each level, and then new colours at the pixels of ``cover``."""
+    """Changes of one photo: more light, a new value for each level, then new colours at the pixels of ``cover``."""
 
     tones: np.ndarray | None = None  # [3,256] float32, new value of each level of each channel
     cover: np.ndarray | None = None  # [h,w] bool, pixels that get `colors`
     colors: np.ndarray | None = None  # [h,w,3] sRGB in [0, 1]
     keeps_brightness: bool = False  # True: covered pixels get only the hue of `colors`; False: its brightness, too
+    light: np.ndarray | None = None  # [h,w] in (0, 1], by which the photo is divided
 
     def __bool__(self) -> bool:
         """Return whether the photo changes at all."""
-        return self.tones is not None or self.cover is not None
+        return any(part is not None for part in (self.light, self.tones, self.cover))
 
     def __call__(self, photo: np.ndarray) -> np.ndarray:
-        """Return a changed photo ``[h,w,3]`` float32 in [0, 1]; photos are as large as the cover, or larger."""
+        """Return a changed photo ``[h,w,3]`` float32 in [0, 1]; photos are as large as light and cover, or larger."""
+        if self.light is not None:
+            light = self.light if self.light.shape == photo.shape[:2] else _enlarge(self.light, photo.shape)
+            photo = (photo / light[..., None]).clip(0, 1)
         if self.tones is not None:
             photo = map_tones(self.tones, photo)
         if self.cover is not None and self.colors is not None:

@@ -32,6 +32,7 @@ from gsmerge.prepare.passers_by import leave_out_passers
 from gsmerge.prepare.repeats import without_repeats
 from gsmerge.prepare.row_colors import add_row_colors
 from gsmerge.prepare.true_pixels import raise_sizes, with_pixels
+from gsmerge.prepare.vignette import divide_by_vignette
 from gsmerge.runtime.record import note, record_choices
 from gsmerge.settings.stages import PrepareOptions
 from gsmerge.types import PicturedScene, Scene
@@ -120,6 +121,13 @@ def drop_masked_rows(p: Prepared, _: PrepareOptions) -> Prepared:
     if p.scene.region is not None:
         return p
     return _leave_out(p, *drop_masked(p.scene))
+
+
+def remove_vignette(p: Prepared, options: PrepareOptions) -> Prepared:
+    """Divide photos, and the Gaussians of their pixels, by light that falls off to a dark ring."""
+    if p.scene.images is None or options.look != "auto":
+        return p
+    return _leave_out(p, *divide_by_vignette(PicturedScene.with_pictures(p.scene, p.scene.images, p.scene.masks)))
 
 
 def follow_scene_edits(p: Prepared, options: PrepareOptions) -> Prepared:
@@ -288,7 +296,7 @@ def draw_unseen(p: Prepared, _: PrepareOptions) -> Prepared:
 
 
 # Names of the steps that leave out, or follow, what people did to photos, masks and scenes
-RULES = ("masked rows", "edits", "overlays", "passers-by")
+RULES = ("masked rows", "vignette", "edits", "overlays", "passers-by")
 STEPS: tuple[Step, ...] = (
     Step("repeats", drop_repeats),
     Step("finite", drop_nonfinite),
@@ -297,6 +305,7 @@ STEPS: tuple[Step, ...] = (
     Step("pixels", lambda p, _: p.after("", scene=with_pixels(p.scene))),
     Step("sizes", raise_tiny_sizes),
     Step("masked rows", drop_masked_rows),
+    Step("vignette", remove_vignette),
     Step("edits", follow_scene_edits),
     Step("overlays", drop_overlays),
     Step("passers-by", drop_passers_by),
