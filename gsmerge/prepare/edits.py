@@ -74,15 +74,20 @@ def follow_edits(scene: Scene) -> tuple[Scene, str]:
     if not is_dense and not left.any():
         return scene, ""
     weak = min(DENSE, NEAR * float(edited.mean()))
+    # what was inserted may have been moved, and then it has left another place
+    lost = _measure_lost(pictured, rows) if is_dense and not scene.has_own_pixels else []
     drawn = render(scene.gaussians, scene.cameras)
     masks = counting_pixels(scene).copy()
     changes = [PhotoChange()] * len(scene)
-    for view, share in zip(views, shares, strict=True):
+    for number, (view, share) in enumerate(zip(views, shares, strict=True)):
         picture = drawn.images[view].clip(0, 1)
         gap = cv2.morphologyEx(left[view].astype(np.uint8), cv2.MORPH_CLOSE, SQUARE_3)
         cover = cv2.dilate(gap, SQUARE_5) > 0  # pixels beside an outline have some of the colour within
         if is_dense:
             cover |= _find_different(share, weak, pictured.images[view], picture)
+        if lost:
+            weak_lost = min(DENSE, NEAR * float(lost[number].mean()))
+            cover |= _find_different(lost[number], weak_lost, pictured.images[view], picture)
         if cover.any():
             changes[view] = PhotoChange(cover=cover, colors=picture)
         is_empty = drawn.alphas[view, ..., 0] < 1 - COVERED_TRANSMITTANCE
@@ -224,6 +229,42 @@ def _measure_shares(scene: PicturedScene, rows: np.ndarray, edited: np.ndarray) 
         return found / np.maximum(number, LEAST_FRONT)
 
     return parallel_map(measure, scene.photo_views)
+
+
+def _measure_lost(scene: PicturedScene, rows: np.ndarray) -> list[np.ndarray]:
+    """Return the share of pixels whose colour none of the Gaussians ``rows [m]`` near them has, as where one was moved.
+
+    There is a small picture ``[h,w]`` for each photo, of windows of 7 x 7 of its pixels, without parts that reach the
+    border. The list is empty if less than half of the photos have a large part. Exporters leave out Gaussians as well,
+    so this tells an edit only in a scene that was edited elsewhere.
+    """
+    size = fit_size((scene.cameras.width, scene.cameras.height), SHARE_SIDE)
+    width, height = size
+    means = scene.gaussians.means[rows]
+    colors = sh0_to_rgb(scene.gaussians.sh0[rows, 0]).clip(0, 1).astype(np.float32)
+    counting = counting_pixels(scene)
+    window = np.full(7, 1 / 7, np.float32)
+
+    def measure(view: int) -> np.ndarray:
+        """Return the shares in one view."""
+        photo = cv2.resize(scene.images[view], size, interpolation=cv2.INTER_AREA)
+        seen, places, _ = _look_up(means, scene, view, width, height)
+        down, across = np.divmod(places[seen], width)
+        own = colors[seen]
+        lost = cv2.resize(counting[view].astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+        for step_down in (-1, 0, 1):
+            for step_across in (-1, 0, 1):
+                line = (down + step_down).clip(0, height - 1)
+                column = (across + step_across).clip(0, width - 1)
+                is_same = np.abs(own - photo[line, column]).mean(-1) < OTHER
+                lost[line[is_same], column[is_same]] = False
+        share = convolve(lost.astype(np.float32), window, window)
+        _, labels = cv2.connectedComponents((share > DENSE).astype(np.uint8), connectivity=8)
+        border = np.concatenate([labels[[0, -1]].ravel(), labels[:, [0, -1]].ravel()])
+        return np.where((labels > 0) & np.isin(labels, border), 0, share)
+
+    shares = parallel_map(measure, scene.photo_views)
+    return shares if 2 * sum(_find_large(share > DENSE).any() for share in shares) >= len(shares) else []
 
 
 def _find_large(mask: np.ndarray) -> np.ndarray:

@@ -132,8 +132,10 @@ def test_moved_gaussians_get_the_pixels_where_they_are_now(with_ball: Scene) -> 
         assert (front_depths <= depths[inside] + 1e-6).all()
 
 
-def test_photos_show_moved_gaussians_and_leave_out_their_old_place(with_ball: Scene) -> None:
-    followed, _ = follow_edits(move_ball(with_ball))
+@pytest.mark.parametrize("own", [True, False])
+def test_photos_show_moved_gaussians_and_leave_out_their_old_place(with_ball: Scene, own: bool) -> None:
+    moved = move_ball(with_ball)
+    followed, _ = follow_edits(moved if own else replace(moved, pixels=None))
     ball = shows_ball(with_ball)
     again = shows_ball(followed)
     assert again.sum() > 0.5 * ball.sum()
