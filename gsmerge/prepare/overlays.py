@@ -44,6 +44,9 @@ MOST_BARE = 0.5  # most pixels of a part without a Gaussian, else it is the back
 LEAST_PART_SEEDS = 8  # fewest seeds of a part, small pixels
 STROKE = 16  # gaps of a mark up to this size are filled, small pixels
 WEAK_STEPS = 6  # width of the strokes of letters into which a part grows along weaker edges, small pixels
+BORDER_STEPS = 4  # small pixels by which borders of photos differ at most
+ROUNDING = 1 / 255  # levels of a photo are rounded
+OPAQUE = 2 / 255  # usual difference of photos at the pixels of an overlay that hides the scene
 SMALL = np.ones((3, 3), np.uint8)
 BESIDE = np.ones((5, 5), np.uint8)
 
@@ -70,20 +73,48 @@ def leave_out_overlays(scene: PicturedScene) -> tuple[PicturedScene, np.ndarray 
         return scene, None, ""
     size = scene.cameras.width, scene.cameras.height
     part = _grow(cv2.resize(small.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST), SMALL)
+    overlay = _grow_in_photos(scene, part)
     pixels = scene.get_pixels()
     if pixels.own:
-        goes = part.reshape(-1)[pixels.homes % part.size]
+        goes = overlay.reshape(-1)[pixels.homes]
     else:
         goes = np.zeros(len(scene.gaussians), bool)
         within = pixels.fronts[:, part]
         beyond = pixels.fronts[:, ~part]
         goes[within[within >= 0]] = True
         goes[beyond[beyond >= 0]] = False
-    overlay = np.broadcast_to(part, scene.images.shape[:3])
-    where = f"{100 * part.mean():.1f} % of their pixels ({_describe_place(part)})"
+    where = f"{100 * overlay.mean():.1f} % of their pixels ({_describe_place(part)})"
     change = f"all photos show the same at {where}: taken for an overlay, and left out with its Gaussians"
     scene = replace(scene, masks=counting_pixels(scene) & ~overlay)
     return take_rows(scene, np.flatnonzero(~goes)), overlay, change
+
+
+def _grow_in_photos(scene: PicturedScene, part: np.ndarray) -> np.ndarray:
+    """Return the pixels ``[v,h,w]`` of an overlay, which covers the ``part [h,w]`` of all photos, and more of some.
+
+    Borders of photos that were stabilised differ by a few pixels. A pixel beside the part belongs to it if it has the
+    same colour, up to the usual difference of photos within the part. A mark through which the scene is seen has no
+    colour of its own, and does not grow.
+    """
+    views = scene.photo_views
+    overlay = np.repeat(part[None], len(scene), 0)
+    covered = scene.images[views][:, part]
+    usual = np.median(covered, 0)
+    differences = np.abs(covered - usual).max(-1)
+    noise = float(np.median(differences))
+    if noise > OPAQUE:
+        return overlay
+    least = np.float32(noise + ROUNDING)
+    for view, difference in zip(views, differences, strict=True):
+        photo = scene.images[view]
+        mark = np.zeros(part.shape, bool)  # pixels that show the mark, and not the scene beside it
+        mark[part] = difference <= least
+        for _ in range(max(1, round(BORDER_STEPS * max(part.shape) / SIDE))):
+            low = cv2.erode(np.where(mark[..., None], photo, np.float32(2)), SMALL)
+            high = cv2.dilate(np.where(mark[..., None], photo, np.float32(-2)), SMALL)
+            mark |= ((photo >= low - least) & (photo <= high + least)).all(-1)
+        overlay[view] |= mark
+    return overlay
 
 
 def find_overlay(scene: PicturedScene) -> np.ndarray | None:
