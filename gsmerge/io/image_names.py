@@ -23,7 +23,7 @@ _CUT_FILM = "save the frames that the model saw as photos, with ffmpeg -i FILM p
 IMAGE_PLACES = (  # places in a folder at which the photos of a scene may lie
     "images_resized",  # photos as WorldMirror saw them; in its images/, tall photos are squeezed
     "images", "input", "context", "rgb", "input_images", "color", "corrected_images", "keyframes/corrected_images",
-    "keyframes/images",
+    "keyframes/images", "image_2", "image_3", "image_0", "image_1", "results",
 )  # fmt: skip
 HOLD_PHOTOS = (".npz", ".gsm")  # endings of files that may have photos inside
 _NAME_FOLDER = "name the folder of the photos with {option}"

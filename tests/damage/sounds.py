@@ -432,6 +432,7 @@ SOUNDS: dict[str, Sound] = {
     "Metashape": Sound("cameras.xml", write_metashape, check_metashape, INSPECT),
     "Metashape moved": Sound("cameras.xml", write_metashape_moved, check_metashape, INSPECT, rare=True),
     "Polycam": Sound("keyframes/corrected_cameras", FORMATS["Polycam"].write, check_cameras, (), packed=True),
+    "Isaac Sim": Sound("camera_params", FORMATS["Isaac Sim"].write, check_cameras, (), packed=True),
     "predictions.npz": Sound("predictions.npz", write_vggt, check_arrays, INSPECT),
     "Long-LRM moved": Sound("opencv_cameras.json", write_moved, check_cameras, INSPECT, packed=True, rare=True),
     "dataparser": Sound("transforms.json", write_dataparser, lambda path: read_dataparser(path, path), (), packed=True),

@@ -79,6 +79,23 @@ def polycam(pose: np.ndarray) -> str:
     return json.dumps({**entries, **POINT, **SIZE})
 
 
+def isaac(pose: np.ndarray) -> str:
+    """Write matrices by which row vectors are multiplied, as USD has them."""
+    projection = np.zeros((4, 4))
+    projection[0, 0] = 2 * FX / WIDTH
+    projection[1, 1] = 2 * FY / HEIGHT
+    projection[2, :2] = 1 - 2 * CX / WIDTH, 2 * CY / HEIGHT - 1
+    projection[2, 3], projection[3, 2] = -1, 0.01
+    return json.dumps(
+        {
+            "cameraModel": "pinhole",
+            "cameraProjection": projection.reshape(-1).tolist(),
+            "cameraViewTransform": pose.T.reshape(-1).tolist(),
+            "renderProductResolution": [WIDTH, HEIGHT],
+        }
+    )
+
+
 def metashape() -> str:
     size = f'<resolution width="{WIDTH}" height="{HEIGHT}"/>'
     cameras = [
@@ -153,6 +170,11 @@ FORMATS = {
         "keyframes/corrected_cameras",
         {f"keyframes/corrected_cameras/{8 + i}.json": polycam(pose) for i, pose in enumerate(C2W_OPENGL)},
         names=("8", "9", "10"),
+    ),
+    "Isaac Sim": CameraText(
+        "camera_params",
+        {f"camera_params/camera_params_{8 + i:04d}.json": isaac(matmul(FLIP, pose)) for i, pose in enumerate(W2C)},
+        names=("rgb_0008", "rgb_0009", "rgb_0010"),
     ),
     "Metashape": CameraText("cameras.xml", {"cameras.xml": metashape()}),
 }

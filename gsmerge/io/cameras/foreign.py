@@ -22,7 +22,12 @@ class Foreign(NamedTuple):
     start: str = ""  # regular expression that the first bytes of its files contain; ^ and $ are ends of lines
 
 
-INTRINSICS = "intrinsic.txt"  # file of intrinsics beside the poses of DA3-Streaming
+# Files of intrinsics beside a list of poses: of DA3-Streaming, KITTI and Replica
+INTRINSICS = "intrinsic.txt"
+CALIBRATION = "calib.txt"
+REPLICA_CAMERA = "cam_params.json"
+BESIDE_POSES = (INTRINSICS, CALIBRATION, REPLICA_CAMERA)
+ISAAC_FILES = "camera_params_*.json"  # cameras of Isaac Sim, one in each
 # most levels of folders, and most paths, that are searched for files of PROGRAMS
 _DEPTH = 3
 _MAX_PATHS = 10_000
@@ -45,7 +50,8 @@ CAMERA_PLACES = (
     "views.npz", "transforms.json", "transforms_train.json", "transforms_test.json", "transforms_val.json",
     "cameras.json", "camera_params.json", "sparse/*", "sparse", "colmap/sparse/*", "colmap",
     "distorted/sparse/*", "exports/npz/results.npz", "exports/mini_npz/results.npz", "results.npz", "cameras.npz",
-    "camera_poses.txt", "keyframes/corrected_cameras", "keyframes/cameras", "reconstruction.json",
+    "camera_poses.txt", "extri.yml", "traj.txt", "poses.txt", "camera_params",
+    "keyframes/corrected_cameras", "keyframes/cameras", "reconstruction.json",
     "opensfm/reconstruction.json", "cameras.xml", "[0-9]*", ".",
 )  # fmt: skip
 # If several entries of this table match a file, the first of these entries names the file's program
@@ -75,7 +81,6 @@ PROGRAMS = (
             " time to each photo, with associate.py of TUM, and turn these with `evo_traj tum` of evo and its option"
             " save_as_kitti into lines of 12 numbers, which are read with one photo for each",
             rf"\A(#.*\n)*({_NUMBER}[ \t]+){{7}}{_NUMBER}\s*$"),
-    Foreign("*.txt", "RealEstate10K", _WRITE_POSES, rf"\Ahttps?:.*\n({_NUMBER}[ \t]+){{18}}{_NUMBER}\s*$"),
     Foreign("*.torch", "a chunk of RealEstate10K", "write the cameras and photos of its scene into views.npz"
             " (docs/reference/formats.md)"),
     Foreign("*.log", "Open3D or Tanks and Temples", _WRITE_POSES, r"\A\d+[ \t]+\d+[ \t]+\d+\s*$"),

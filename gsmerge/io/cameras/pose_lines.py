@@ -1,21 +1,35 @@
-"""Read text files of DA3-Streaming and VGGT-Long with a pose in each line, and files of intrinsics beside them."""
+"""Read text files with a pose in each line, and the intrinsics beside them.
+
+DA3-Streaming and VGGT-Long write such files, and so do the data sets KITTI and Replica.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
-from itertools import repeat
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.io.bounds import read_lines
+from gsmerge.io.bounds import read_json, read_lines
 from gsmerge.io.cameras.camera_file import StoredView, check_camera_count, make_pinhole
-from gsmerge.io.cameras.camera_source import CameraSource, StoredCameras
-from gsmerge.io.cameras.foreign import INTRINSICS
+from gsmerge.io.cameras.camera_source import CameraSource, StoredCameras, number_errors, to_number
+from gsmerge.io.cameras.foreign import CALIBRATION, INTRINSICS, REPLICA_CAMERA
+from gsmerge.method.kernels.matrices import invert, matmul
 
 _POSE_COLUMNS = (12, 16)  # possible counts of numbers in a line with a pose
+_KITTI_CAMERAS = (2, 3, 0, 1)  # cameras of KITTI, whose photos lie in image_2 and so on, the most preferred first
+
+
+class _Intrinsics(NamedTuple):
+    """Intrinsics of the views of a list of poses, and what a program's list of poses does not say."""
+
+    Ks: list[np.ndarray | None]  # ``[3,3]`` for all views, or for each view; [None] if they are unknown
+    size: tuple[int, int] = (0, 0)  # pixels; 0 if unknown
+    name: str = "{:06d}"  # name of the photo of a view, from its number
+    offset: np.ndarray = np.eye(4)  # [4,4] from the frame of the pose to the camera, both with OpenCV axes
 
 
 def lists_poses(path: Path) -> bool:
@@ -29,21 +43,70 @@ def lists_poses(path: Path) -> bool:
 def read_poses(source: CameraSource) -> StoredCameras:
     """Read the cameras of a text file, each line of which has the 12 or 16 numbers of a pose, row by row.
 
-    The file :data:`INTRINSICS` beside it may have one line of intrinsics for all views, or a line for each view. The
-    size of the views is unknown. Raise SceneError if a line of poses has other than 12 or 16 numbers, or a line of
-    intrinsics other than 4.
+    A file beside it may have the intrinsics: :data:`INTRINSICS`, with one line for all views or a line for each,
+    KITTI's :data:`CALIBRATION`, or Replica's :data:`REPLICA_CAMERA`, which may also lie in the folder above. Raise
+    SceneError if a line of poses has other than 12 or 16 numbers, or if intrinsics are damaged.
     """
     path = source.path
-    intrinsics = source.path.parent / INTRINSICS
     poses = _parse(path, read_lines(path), _POSE_COLUMNS)
-    Ks: list[np.ndarray | None] = [None]
-    if intrinsics.is_file():
-        # A line has fx, fy, cx and cy in pixels
-        Ks = [make_pinhole(*row) for row in _parse(intrinsics, read_lines(intrinsics), lengths=(4,))]
+    folder = path.parent
+    places: list[tuple[Path, Callable[[Path], _Intrinsics]]] = [
+        (folder / INTRINSICS, _read_lines_of_intrinsics),
+        (folder / CALIBRATION, _read_kitti),
+        (folder / REPLICA_CAMERA, _read_replica),
+        (folder.parent / REPLICA_CAMERA, _read_replica),
+    ]
+    found = next(((place, read) for place, read in places if place.is_file()), None)
+    intrinsics = _Intrinsics([None]) if found is None else found[1](found[0])
+    Ks = intrinsics.Ks
     if len(Ks) not in (1, len(poses)):
-        raise SceneError(intrinsics, f"expected one line, or one for each of {len(poses)} views, found {len(Ks)}")
-    pairs = zip(poses, repeat(Ks[0]) if len(Ks) == 1 else Ks, strict=False)
-    return StoredCameras([StoredView(f"{i:06d}", pose.reshape(-1, 4), K, (0, 0)) for i, (pose, K) in enumerate(pairs)])
+        raise SceneError(
+            folder / INTRINSICS, f"expected one line, or one for each of {len(poses)} views, found {len(Ks)}"
+        )
+    to_pose = None if (intrinsics.offset == np.eye(4)).all() else invert(intrinsics.offset)
+    views = list[StoredView]()
+    for i, numbers in enumerate(poses):
+        pose = numbers.reshape(-1, 4)
+        if to_pose is not None:
+            pose = matmul(pose, to_pose)
+        views.append(StoredView(intrinsics.name.format(i), pose, Ks[i % len(Ks)], intrinsics.size))
+    return StoredCameras(views)
+
+
+def _read_lines_of_intrinsics(path: Path) -> _Intrinsics:
+    """Read lines of fx, fy, cx and cy in pixels, of all views or of each."""
+    return _Intrinsics([make_pinhole(*row) for row in _parse(path, read_lines(path), lengths=(4,))])
+
+
+def _read_kitti(path: Path) -> _Intrinsics:
+    """Read the camera of KITTI whose photos are there.
+
+    A line has the name of a camera, P0 to P3, and the 12 numbers of its projection from the frame of the poses, which
+    is that of camera 0: the intrinsics, and times these the shift of the camera.
+    """
+    projections = dict[str, np.ndarray]()
+    for line in read_lines(path):
+        name, _, numbers = line.partition(":")
+        if name.startswith("P") and len(numbers.split(maxsplit=12)) == 12:
+            with number_errors(path, f"{name}: expected numbers"):
+                projections[name.strip()] = np.array(numbers.split(), np.float64).reshape(3, 4)
+    cameras = [camera for camera in _KITTI_CAMERAS if f"P{camera}" in projections]
+    if not cameras:
+        raise SceneError(path, "expected a line P2 with 12 numbers, as in KITTI's odometry, found none")
+    shown = [camera for camera in cameras if (path.parent / f"image_{camera}").is_dir()]
+    projection = projections[f"P{(shown or cameras)[0]}"]
+    offset = np.eye(4)
+    with number_errors(path, "expected intrinsics"):
+        offset[:3, 3] = matmul(invert(projection[:, :3]), projection[:, 3])
+    return _Intrinsics([projection[:, :3]], offset=offset)
+
+
+def _read_replica(path: Path) -> _Intrinsics:
+    """Read the camera of all views of Replica, as NICE-SLAM renders it."""
+    with number_errors(path, "expected an object 'camera' with w, h, fx, fy, cx and cy"):
+        camera: dict[str, Any] = read_json(path)["camera"]
+        fx, fy, cx, cy, width, height = (to_number(camera[key]) for key in ("fx", "fy", "cx", "cy", "w", "h"))
+        return _Intrinsics([make_pinhole(fx, fy, cx, cy)], (round(width), round(height)), "frame{:06d}")
 
 
 def _parse(path: Path, lines: Iterable[str], lengths: tuple[int, ...]) -> list[np.ndarray]:

@@ -10,8 +10,16 @@ from gsmerge.errors import SceneError
 from gsmerge.io.bounds import check_file
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.cameras.camera_source import CameraSource, check_objects
-from gsmerge.io.cameras.foreign import CAMERA_PLACES, INTRINSICS, check_program
-from gsmerge.io.cameras.table import CAMERA_ENDINGS, CAMERA_FORMATS, KEYFRAME, SHARP_PLY, is_colmap, is_keyframes
+from gsmerge.io.cameras.foreign import BESIDE_POSES, CAMERA_PLACES, check_program
+from gsmerge.io.cameras.table import (
+    CAMERA_ENDINGS,
+    CAMERA_FORMATS,
+    KEYFRAME,
+    SHARP_PLY,
+    is_colmap,
+    is_isaac,
+    is_keyframes,
+)
 from gsmerge.io.cameras.viewer_cameras import ENDING
 from gsmerge.io.image_names import natural_order
 from gsmerge.runtime.arguments import check_arguments
@@ -55,7 +63,7 @@ def find_other_cameras(folder: Path) -> Path | None:
         path
         for path in sorted(folder.glob("[!.]*"))
         if path.suffix in _CANDIDATE_ENDINGS
-        and path.name != INTRINSICS
+        and path.name not in BESIDE_POSES
         and not path.name.endswith(ENDING)
         and path.is_file()
     ]
@@ -106,10 +114,11 @@ def read_cameras(path: StrPath, *, folder: Path | None = None) -> CameraFile:
     if not path.is_dir():
         check_program(path)
         check_file(path)
-        # A file of a COLMAP model or of Polycam's keyframes stands for its folder
+        # A file of a COLMAP model, of Polycam's keyframes or of Isaac Sim stands for its folder
         if path.suffix == ".json":
             is_keyframe = is_keyframes(path.parent) and KEYFRAME in CameraSource(path).object
-            path = path.parent if is_keyframe else path
+            is_of_isaac = is_isaac(path.parent) and "cameraViewTransform" in CameraSource(path).object
+            path = path.parent if is_keyframe or is_of_isaac else path
         elif path.suffix in (".bin", ".txt") and path.stem in ("cameras", "images", "points3D"):
             if not is_colmap(path.parent):
                 raise SceneError(path, "expected a COLMAP model with cameras and images files, found no pair of them")

@@ -10,8 +10,17 @@ from functools import partial
 from pathlib import Path
 
 from gsmerge.frozen import dataclass, replace
-from gsmerge.io.cameras.camera_file import C2W_OPENCV, C2W_OPENGL, W2C_OPENCV, CameraFile, Convention, make_camera_file
+from gsmerge.io.cameras.camera_file import (
+    C2W_OPENCV,
+    C2W_OPENGL,
+    W2C_OPENCV,
+    W2C_OPENGL,
+    CameraFile,
+    Convention,
+    make_camera_file,
+)
 from gsmerge.io.cameras.camera_source import CameraSource, StoredCameras
+from gsmerge.io.cameras.foreign import ISAAC_FILES
 from gsmerge.io.cameras.programs import (
     SHARP,
     is_long_lrm,
@@ -77,6 +86,11 @@ def is_keyframes(folder: Path) -> bool:
     return first_file.is_file() and f'"{KEYFRAME}"'.encode() in read_start(first_file)
 
 
+def is_isaac(folder: Path) -> bool:
+    """Return whether a folder holds the cameras of Isaac Sim, each in a ``.json``."""
+    return next(folder.glob(ISAAC_FILES), None) is not None
+
+
 def _has_views_with(source: CameraSource, key: str) -> bool:
     """Return whether a JSON file has a list ``views`` of objects, and at least one of the objects has the ``key``."""
     views = source.object.get("views")
@@ -87,6 +101,7 @@ _array_names, _is_da3 = _lazy("npz_files.array_names"), _lazy("npz_files.is_da3"
 _READ_COLMAP = _lazy("colmap.read_colmap")
 _read_da3 = _lazy("npz_files.read_da3")
 _LISTS_POSES = _lazy("pose_lines.lists_poses")
+_IS_REALESTATE, _IS_EASYVOLCAP = _lazy("datasets.is_realestate"), _lazy("datasets.is_easyvolcap")
 _read_state_views = LazyFunction("gsmerge.io.formats.gsm", "read_views")
 
 _TRANSFORMS_JSON = ViewLayout(
@@ -143,6 +158,7 @@ _OPENSFM = ViewLayout(
 _POLYCAM = ViewLayout(
     views=list_keyframes, pose=Matrix("transform"), K=PinholeKeys("fx", "fy", "cx", "cy"), size=("width", "height")
 )
+_ISAAC = replace(_POLYCAM, views=_lazy("datasets.list_isaac_cameras"))
 _METASHAPE = ViewLayout(
     views=_lazy("metashape.list_metashape_cameras"),
     pose=Matrix("transform"),
@@ -164,11 +180,19 @@ CAMERA_FORMATS = (
                  W2C_OPENCV, "pixels; lenses", lambda file: _holds_model(file.path, ".bin")),
     CameraFormat("Polycam", "`keyframes/corrected_cameras` of Polycam", "", _POLYCAM,
                  C2W_OPENGL, "pixels", lambda file: is_keyframes(file.path)),
+    CameraFormat("Isaac Sim", "`camera_params_0000.json` of Isaac Sim's BasicWriter, beside `rgb_0000.png`", "", _ISAAC,
+                 W2C_OPENGL, "pixels", lambda file: is_isaac(file.path)),
     CameraFormat("COLMAP text", "COLMAP: `cameras.txt` and `images.txt`", "", partial(_READ_COLMAP, suffix=".txt"),
                  W2C_OPENCV, "pixels; lenses", lambda file: _holds_model(file.path, ".txt")),
-    CameraFormat("pose list", "`camera_poses.txt` of DA3-Streaming, VGGT-Long: 12 or 16 numbers a line", ".txt",
-                 _lazy("pose_lines.read_poses"), C2W_OPENCV, "pixels, in `intrinsic.txt`; may be missing",
+    CameraFormat("RealEstate10K", "`.txt` of RealEstate10K: the video's address, then 19 numbers a line", ".txt",
+                 _lazy("datasets.read_realestate"), W2C_OPENCV, "divided by the size",
+                 lambda file: _IS_REALESTATE(file.path)),
+    CameraFormat("pose list", "`camera_poses.txt` of DA3-Streaming, VGGT-Long, `poses.txt` of KITTI, `traj.txt` of"
+                 " Replica: 12 or 16 numbers a line", ".txt", _lazy("pose_lines.read_poses"), C2W_OPENCV,
+                 "pixels, in `intrinsic.txt`, `calib.txt` or `cam_params.json`; may be missing",
                  lambda file: _LISTS_POSES(file.path)),
+    CameraFormat("EasyVolcap", "`extri.yml` and `intri.yml` of EasyVolcap and EasyMocap", ".yml",
+                 _lazy("datasets.read_easyvolcap"), W2C_OPENCV, "pixels; lenses", _IS_EASYVOLCAP),
     CameraFormat("Long-LRM", "dataset file of Long-LRM", ".json", _LONG_LRM, W2C_OPENCV, "pixels", is_long_lrm),
     CameraFormat("transforms.json", "`transforms.json` of nerfstudio, instant-ngp; `transforms_train.json` of Blender",
                  ".json", _TRANSFORMS_JSON, C2W_OPENGL, "pixels or field of view; may be missing; lenses",

@@ -45,8 +45,6 @@ FILES = [
     ("pose/0.txt", "1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n", "NSVF", "transforms.json"),
     ("poses/0.txt", "1 0 0 -.5 0 1 0 0 0 0 1 0 0 0 0 1", "SRN", "transforms.json"),
     ("pred_traj.txt", "# time tx\n0.0 0 0 1e-3 0 0 0 1\n1.0 0 0 2 0 0 0 1\n", "MonST3R", "evo_traj tum"),
-    ("0a1b.txt", "https://www.youtube.com/watch?v=a\n100 .9 .9 .5 .5 0 0 1 0 0 0 0 1 0 0 0 0 1 0\n", "RealEstate10K",
-     "transforms.json"),
     ("000000.torch", "PK\3\4", "RealEstate10K", "views.npz"),
     ("Barn.log", "0 0 0\n1 0 0 0\n", "Tanks and Temples", "transforms.json"),
     ("seq-01/frame-000000.pose.txt", "1 0 0 0\n", "7-Scenes", "kapture_import_7scenes.py"),
