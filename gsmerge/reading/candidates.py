@@ -14,10 +14,15 @@ from gsmerge.reading.alignment import estimate_cameras
 from gsmerge.reading.photos.scene_photos import NO_PHOTOS, ScenePhotos, find_photos
 from gsmerge.reading.scene_files import SceneFiles
 
+WITHOUT_LENS = "without their lens"  # photos may be undistorted already, although a file has the lens that took them
+
 # Ways of reading cameras otherwise than their file says, by the words that a user reads in the table of candidates.
 # Each function returns the cameras in its way, or None if the file gives no reason to try it. See "A way of reading
 # cameras" in docs/internals/adding.md
-WAYS: dict[str, Callable[[CameraFile], CameraFile | None]] = {}
+WAYS: dict[str, Callable[[CameraFile], CameraFile | None]] = {
+    WITHOUT_LENS: lambda camera_file: replace(camera_file, lenses=()) if camera_file.lenses else None
+}
+SHOWN_BY_PHOTOS = frozenset({WITHOUT_LENS})  # ways that are tried only if photos fit better so
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ from gsmerge.frozen import dataclass, replace
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.image_names import IMAGE_SUFFIXES
 from gsmerge.reading.alignment import ESTIMATED, CameraCheck, UnseenError
-from gsmerge.reading.candidates import Candidate, Views
+from gsmerge.reading.candidates import SHOWN_BY_PHOTOS, Candidate, Views
 from gsmerge.reading.choice import ESTIMATED_CAMERAS, Choice, make_choice
 from gsmerge.reading.loaded import Loaded
 from gsmerge.reading.photos.scene_photos import MismatchError, describe_missing
@@ -38,6 +38,7 @@ class Evidence:
     photo_place: Path | None = None  # folder or file of its photos; None without any
     has_photos: bool = False
     num_shown: int = 0  # number of its views that a photo shows
+    better_ways: tuple[str, ...] = ()  # keys of ``WAYS`` in which photos fit the views better than as the file says
     photos_explain: bool = False  # True: the photos that names propose explain what most views show
     photo_error: SceneError | None = None  # why its photos are left out
     notes: tuple[str, ...] = ()  # of the scene with the candidate
@@ -58,11 +59,17 @@ class Evidence:
 def is_needed(candidate: Candidate, tried: Sequence[Evidence]) -> bool:
     """Return whether a candidate has to be examined, after those that were ``tried``.
 
-    Camera files are examined until one certainly fits. Cameras of the rows are estimated if no file fits, or if rows
+    Camera files are examined until one certainly fits, and then in the ways in which its photos fit better. Cameras of
+    the rows are estimated if no file fits, or if rows
     form more views than the chosen file has cameras. Cameras that the caller named are not replaced if they do not fit,
     and neither are cameras beside photos that the caller named and that are to blame.
     """
     if not candidate.replaces_files:
+        if candidate.way in SHOWN_BY_PHOTOS:
+            same = [one for one in tried if one.files.cameras == candidate.files.cameras]
+            return any(
+                is_better_read(one, candidate) or isinstance(one.error, MismatchError | UnseenError) for one in same
+            )
         return not any(map(certainly_fits, tried))
     files = tried[0].files
     best = choose(tried)
@@ -89,8 +96,15 @@ def certainly_fits(evidence: Evidence) -> bool:
     return not files.below and (evidence.are_pixels or not list_doubts(evidence.notes))
 
 
+def is_better_read(evidence: Evidence, other: Candidate) -> bool:
+    """Return whether photos fit the views better if the cameras are read in the way of another candidate."""
+    return other.way in evidence.better_ways and other.files.cameras == evidence.files.cameras
+
+
 def choose(tried: Sequence[Evidence]) -> Evidence | None:
     """Choose the first cameras that certainly fit, or else the first that may fit; None if none does.
+
+    If their photos fit better in another way of reading the file, it is read in this way.
 
     Cameras of the rows, if they were needed, are chosen if no camera file fits, or if the file lacks a camera of some
     view; a note says so. They are not chosen if photos that the caller named cannot be used with them.
@@ -98,6 +112,8 @@ def choose(tried: Sequence[Evidence]) -> Evidence | None:
     files = tried[0].files
     fitting = [one for one in tried if one.error is None and not one.candidate.replaces_files]
     best = next(filter(certainly_fits, fitting), fitting[0] if fitting else None)
+    if best is not None:
+        best = next((one for one in fitting if is_better_read(best, one.candidate)), best)
     rows = tried[-1] if tried[-1].candidate.replaces_files else None
     if rows is None or rows.error is not None or lacks_named_photos(rows):
         return best
@@ -115,7 +131,8 @@ def lacks_named_photos(evidence: Evidence) -> bool:
 
 def release_spare(evidence: Evidence, earlier: Sequence[Evidence]) -> Evidence:
     """Return evidence without its scene, whose arrays take memory, if an earlier camera file is chosen before it."""
-    may_be_chosen = evidence.candidate.replaces_files or certainly_fits(evidence)
+    is_better_way = any(is_better_read(one, evidence.candidate) for one in earlier)
+    may_be_chosen = evidence.candidate.replaces_files or certainly_fits(evidence) or is_better_way
     is_spare = not may_be_chosen and any(one.error is None for one in earlier)
     return replace(evidence, load=None) if is_spare else evidence
 
@@ -268,6 +285,8 @@ def _judge(one: Evidence, chosen: Evidence | None) -> tuple[str, bool]:
         return f"{fact}, but the photos that were named do not show them", False
     if chosen is not None and one.candidate is not chosen.candidate and chosen.candidate.replaces_files:
         return f"{fact}, but they are {one.num_views}, and the Gaussians form {chosen.num_views} views", False
+    if chosen is not None and is_better_read(one, chosen.candidate):
+        return f"{fact}, but the photos fit better if they are read {chosen.candidate.way}", False
     is_shown = one.photo_error is None and (one.are_pixels or one.has_photos or one.photo_place is None)
     is_chosen = chosen is None or one.candidate is chosen.candidate
     return fact if is_chosen and is_shown else f"{fact}, but no photo shows that they fit", True

@@ -8,14 +8,20 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cache, partial
 
+import numpy as np
+
 from gsmerge.errors import SceneError, attempt
 from gsmerge.frozen import dataclass, replace
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.formats.read_gaussians import GaussianFile
 from gsmerge.io.formats.rows import RESULT_COMMENT
 from gsmerge.io.image_names import IMAGE_PLACES, describe_unread
+from gsmerge.io.photo_files import as_floats, photo_size, resize_to
+from gsmerge.method.compare.offsets import OFFSET_PIXELS, correlate_parts
+from gsmerge.method.compare.similarity import stands_out
+from gsmerge.method.compare.view_pictures import show_views
 from gsmerge.reading.alignment import CameraCheck, UnseenError
-from gsmerge.reading.candidates import Views
+from gsmerge.reading.candidates import WITHOUT_LENS, Views
 from gsmerge.reading.choose import Evidence, blames_photos, choose_photos, needs_bare
 from gsmerge.reading.exporters import ReadHints
 from gsmerge.reading.loaded import Loaded
@@ -109,9 +115,32 @@ def _measure(
         own_views=load.own_views,
         has_photos=load.scene.images is not None,
         num_shown=len(load.scene.photo_views),
+        better_ways=(WITHOUT_LENS,) if _fits_without_lens(load) else (),
         notes=(*notes_on_way, *load.notes),
         load=load,
     )
+
+
+def _fits_without_lens(load: Loaded) -> bool:
+    """Return whether photos fit the views of a scene better as they are stored than undistorted, part by part."""
+    source = load.source
+    images = load.scene.images
+    if source is None or images is None or source.size is None or not source.camera_file.lenses:
+        return False
+    pictures = source.photos.pictures
+    stored_size = photo_size(pictures)
+    if stored_size is None:
+        return False
+    if stored_size != source.size:
+        pictures = resize_to(stored_size, source.size).photos(pictures)
+    if source.transform is not None:
+        pictures = source.transform.photos(pictures)
+    shown = show_views(replace(load.scene, masks=None), OFFSET_PIXELS)
+    gains = [
+        correlate_parts(shown, view, as_floats([pictures[view]])[0]) - correlate_parts(shown, view, images[view])
+        for view in load.scene.photo_views
+    ]
+    return stands_out(np.concatenate(gains))
 
 
 @dataclass(frozen=True, eq=False)

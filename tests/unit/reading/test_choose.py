@@ -13,7 +13,7 @@ from messages import noted
 from gsmerge.errors import Doubt, Note, SceneError
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.reading.alignment import ESTIMATED, CameraCheck
-from gsmerge.reading.candidates import Candidate, Views, list_candidates
+from gsmerge.reading.candidates import WAYS, Candidate, Views, list_candidates
 from gsmerge.reading.choice import Choice, candidate_lines
 from gsmerge.reading.choose import (
     Evidence,
@@ -34,7 +34,9 @@ from gsmerge.reading.scene_files import SceneFiles
 FOLDER = Path("scene")
 FIRST, SECOND, IMAGES = FOLDER / "transforms.json", FOLDER / "sparse/0", FOLDER / "images"
 FILES = SceneFiles(FOLDER / "a.ply", FIRST, IMAGES, root=FOLDER, others=(SECOND,))
-CAMERAS = list_candidates(FILES)  # the first file, the second file, and cameras of the rows
+LISTED = list_candidates(FILES)
+CAMERAS = [one for one in LISTED if not one.way]  # the first file, the second file, and cameras of the rows
+OTHERWISE = next(one for one in LISTED if one.way)  # the first file, read in another way
 ROWS = CAMERAS[-1]
 DAMAGED = SceneError(FIRST, "expected cameras, found none", "export them again")
 OTHER_PHOTOS = SceneError(IMAGES, "other photos")
@@ -70,7 +72,8 @@ def with_files(evidence: Evidence, **changes: Any) -> Evidence:
 def test_files_are_tried_in_order_and_the_rows_last() -> None:
     assert [one.files.cameras for one in CAMERAS] == [FIRST, SECOND, None]
     assert [one.replaces_files for one in CAMERAS] == [False, False, True]
-    assert len(list_candidates(FILES, keeps_cameras=True)) == 2
+    assert [one.files.cameras for one in LISTED] == [FIRST, SECOND] * (1 + len(WAYS)) + [None]
+    assert len(list_candidates(FILES, keeps_cameras=True)) == len(LISTED) - 1
     assert len(list_candidates(replace(FILES, cameras=None, others=()))) == 1  # its cameras are those of the rows
     below = replace(FILES, cameras=None, below=True, others=(FOLDER / "a/sparse", FOLDER / "b/sparse"))
     assert [one.files.cameras for one in list_candidates(below)] == [None]  # several folders may be several scenes
@@ -95,6 +98,23 @@ def test_pixels_or_photos_make_cameras_certain(facts: dict[str, Any], files: dic
     evidence = with_files(fits(**facts), **files)
     assert certainly_fits(evidence) is expected
     assert is_needed(CAMERAS[1], [evidence]) is not expected
+
+
+def test_cameras_are_read_in_the_way_in_which_their_photos_fit_better() -> None:
+    first = fits(CAMERAS[0], has_photos=True, photos_explain=True)
+    doubted = replace(first, better_ways=(OTHERWISE.way,))
+    otherwise = fits(OTHERWISE, has_photos=True)
+    assert not is_needed(OTHERWISE, [first])
+    assert is_needed(OTHERWISE, [doubted])
+    assert not is_needed(CAMERAS[1], [doubted])
+    assert choose([doubted, otherwise]) is otherwise
+    assert choose([doubted, fails(OTHERWISE)]) is doubted
+    assert choose([first, otherwise]) is first
+    load: Any = object()
+    assert release_spare(replace(otherwise, load=load), [doubted]).load is load
+    choices = give_reasons(LISTED, [doubted, otherwise], otherwise)
+    assert OTHERWISE.way in choices[0].reason
+    assert [OTHERWISE.way in str(one.path) for one in choices if one.chosen and one.kind == "cameras"] == [True]
 
 
 def test_the_first_certain_cameras_precede_the_first_that_fit() -> None:

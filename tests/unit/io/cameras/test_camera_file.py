@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from exports import smooth_scene
-from messages import refuses
+from messages import noted, refuses
 from tiny_scene import (
     FLIP,
     Tiny,
@@ -151,6 +151,14 @@ def test_photos_of_a_lens_are_undistorted_with_a_note(tmp_path: Path, kind: str)
     before = np.abs(taken.images[inner].astype(float) - SMOOTH.images[inner]).mean()
     after = np.abs(scene.images[inner] * 255 - SMOOTH.images[inner]).mean()
     assert after < 0.4 * before
+
+
+def test_photos_that_are_undistorted_already_stay(tmp_path: Path) -> None:
+    SMOOTH.save(tmp_path, cameras=False)
+    as_transforms(tmp_path, SMOOTH, [-0.3, 0.08, 0.01, -0.01])
+    loaded = load_scene(tmp_path)
+    assert noted(loaded.notes, "transforms.json", "without their lens")
+    np.testing.assert_allclose(loaded.scene.images * 255, SMOOTH.images, atol=2)
 
 
 def test_cameras_with_a_lens_are_refused_without_their_photos(tmp_path: Path) -> None:
