@@ -8,7 +8,7 @@ from gsmerge.errors import SceneError
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.reading.alignment.resection import projective_error
 from gsmerge.reading.alignment.score import Alignment, AlignmentInput, check_pairs, sample_pixels
-from gsmerge.reading.alignment.unaligned import MAX_FRONT_RATIO, check_cameras
+from gsmerge.reading.alignment.unaligned import MAX_FRONT_RATIO, MIRRORED, UNMIRROR, check_cameras, is_mirrored
 from gsmerge.types import Cameras, Gaussians
 
 
@@ -29,6 +29,8 @@ def refuse_other_cameras(inputs: AlignmentInput, camera_file: CameraFile) -> Non
     are_pixels = projective_error(first_view.points, first_view.pixels) < max_multiple * alignment.limit_px
     check = check_cameras(inputs.gaussians, inputs.valid, cameras, inputs.images, foremost=True)
     if are_pixels and not check.color_ratio <= MAX_FRONT_RATIO:
+        if is_mirrored(inputs):
+            raise SceneError(camera_file.path, f"expected cameras of the Gaussians, found {MIRRORED}", UNMIRROR)
         raise misalignment_error(camera_file.path, alignment, None)
 
 

@@ -84,7 +84,11 @@ def fit_frame(cameras: Cameras, poses: np.ndarray, scale: float | None) -> Simil
     If all cameras stand in one place, they do not determine the scale, and ``scale`` is used, or 1 if ``scale`` is
     None.
     """
-    frame = fit_similarity(cameras.viewmats, poses, scale or 1.0)
+    return describe_frame(fit_similarity(cameras.viewmats, poses, scale or 1.0))
+
+
+def describe_frame(frame: Similarity) -> Similarity:
+    """Return a similarity with a description in words."""
     angle = np.degrees(arccos(np.clip((np.trace(frame.rotation) - 1) / 2, -1, 1)))
     shift = ", ".join(f"{value:.4g}" for value in frame.shift)
     text = f"rotated by {angle:.1f} degrees, positions scaled by {frame.scale:.4g} and shifted by {shift}"

@@ -10,12 +10,20 @@ import numpy as np
 from gsmerge.errors import SceneError
 from gsmerge.frozen import dataclass, replace
 from gsmerge.io.cameras.camera_file import Convention
-from gsmerge.method.geometry.transforms import IDENTITY, Similarity, is_inside, project_points, sh0_to_rgb
+from gsmerge.method.geometry.transforms import (
+    IDENTITY,
+    Similarity,
+    is_inside,
+    motion_matrices,
+    project_points,
+    sh0_to_rgb,
+)
 from gsmerge.method.kernels.elementary import exp
 from gsmerge.method.kernels.matrices import invert, matmul
 from gsmerge.reading.alignment.conventions import PosesInConvention, other_conventions
 from gsmerge.reading.alignment.frames import exporter_frames, quarter_turns
 from gsmerge.reading.alignment.grids import Grid, with_poses
+from gsmerge.reading.alignment.registration.localise import find_frames, mirror
 from gsmerge.reading.alignment.score import AlignmentInput, photo_colors
 from gsmerge.types import Cameras, Gaussians
 
@@ -31,6 +39,12 @@ _SEEN_GAUSSIANS = 20_000  # number of Gaussians that are projected, to estimate 
 # which is small, as the scores of two frames have to differ by 5 % or more
 _COMPARED_GAUSSIANS = 5000
 MAX_FRONT_RATIO = 0.5  # like RANDOM_SHARE, but only for the foremost Gaussians, in a frame that was chosen by colours
+# Colours of the foremost Gaussians in their own frame have ratios of .13 to .44, and of _TURNED times as much or more
+# if cameras are turned by _TURN, radians. If cameras are wrong by two degrees, ratios are above _SURE_RATIO, and some
+# turn makes them at most 1.25 times as large
+_SURE_RATIO = 0.3
+_TURN = 0.035
+_TURNED = 1.32
 # A Gaussian counts as foremost if its depth is at most _FRONT times the least depth in its cell. A cell has _PER_CELL
 # Gaussians on average
 _FRONT = 1.05
@@ -46,6 +60,10 @@ _FINER = ((0.1, 11, 2000), (0.015, 7, 20_000), (0.004, 5, 20_000))
 _PLACES = tuple(np.linspace(*ends).tolist() for ends in ((-0.2, 1.2, 15), (-0.2, 1.2, 15), (-1.5, 2.25, 16)))
 # For each finer search around the best places: number of Gaussians, number of places that are kept, size of a step
 _SHIFT_STEPS = [(2000 if i < 5 else 20_000, 8 if i < 5 else 1, 0.05 * 0.6**i) for i in range(10)]
+
+
+MIRRORED = "photos that show the Gaussians as in a mirror"
+UNMIRROR = "flip an axis of the Gaussians back, or export them without the flip"
 
 
 @dataclass(frozen=True)
@@ -232,6 +250,8 @@ def choose_cameras(
     if frame is not None:
         _check_colors(inputs, frame.move_cameras(inputs.cameras), frame.description, no_pixels)
         return replace(grid, frame=frame, shown_by="photos' colours"), None, []
+    if is_mirrored(inputs):
+        raise UnseenError(no_pixels.path, f"{no_pixels.problem}; {MIRRORED}", UNMIRROR)
     if not check.ok:
         remedy = f"{no_pixels.remedy}, or write their shift (x y z) to offset.txt beside the file"
         remedy += ", or copy nerfstudio's dataparser_transforms.json there"
@@ -246,6 +266,14 @@ def choose_cameras(
     cameras = replace(inputs.cameras, viewmats=poses.viewmats)
     _check_colors(inputs, cameras, f"read as {poses.description}", no_pixels)
     return with_poses(grid, poses), check, []
+
+
+def is_mirrored(inputs: AlignmentInput) -> bool:
+    """Return whether the photos show the Gaussians as in a mirror, and not as they are."""
+    if inputs.images.any((1, 2, 3)).sum() < 2 or _fits_exactly(inputs, IDENTITY):
+        return False
+    mirrored = mirror(inputs)
+    return any(_fits_exactly(mirrored, frame) for frame in find_frames(mirrored))
 
 
 def _check_colors(inputs: AlignmentInput, cameras: Cameras, name: str, no_pixels: SceneError) -> None:
@@ -277,7 +305,13 @@ def _choose_frame(inputs: AlignmentInput, usual: CameraCheck) -> Similarity | No
     best, score = _best_frame(inputs, frames if usual.ok else [*frames, *quarter_turns()])
     stands_out = _stands_out(inputs, best, score)
     # views without a photo are black and do not count; one photo is too few, because it fits somewhere in any scene
-    if inputs.scale is None and not stands_out and inputs.images.any((1, 2, 3)).sum() > 1:
+    has_photos = inputs.scale is None and inputs.images.any((1, 2, 3)).sum() > 1
+    if has_photos and not (stands_out and _fits_exactly(inputs, best)):
+        found = next((frame for frame in find_frames(inputs) if _fits_exactly(inputs, frame)), None)
+        if found is not None:
+            best, score = _best_frame(inputs, [best, found])
+            stands_out = best is found or stands_out
+    if has_photos and not stands_out:
         # frames of `exporter_frames`: rotated into the first camera, turned to y up, and moved into the first camera
         solved = [_solve_scale(inputs, frame) for frame in (IDENTITY, frames[1], frames[4], frames[-1])]
         best, score = _best_frame(inputs, [best, *solved, *([] if usual.ok else _solve_shift(inputs))])
@@ -286,6 +320,29 @@ def _choose_frame(inputs: AlignmentInput, usual: CameraCheck) -> Similarity | No
         return None
     usual_score = max(_score_frame(inputs, IDENTITY), usual.score if usual.ok else 0.0)
     return best if score > _FRAME_GAIN * usual_score else None
+
+
+def _fits_exactly(inputs: AlignmentInput, frame: Similarity) -> bool:
+    """Return whether photos have the colours of the foremost Gaussians in a frame, and less so if cameras are turned.
+
+    If cameras are wrong by two degrees or more, some turn of all of them fits about as well, or better.
+    """
+
+    def measure(axis: int, radians: float) -> float:
+        """Return the colour ratio of the foremost Gaussians if cameras are turned about one of their axes."""
+        cameras = frame.move_cameras(inputs.cameras)
+        motion = np.zeros((1, 6))
+        motion[0, axis] = radians
+        cameras = replace(cameras, viewmats=matmul(motion_matrices(motion)[0], cameras.viewmats.astype(np.float64)))
+        checked = inputs.gaussians, inputs.valid, cameras, inputs.images, _COMPARED_GAUSSIANS
+        return check_cameras(*checked, foremost=True).color_ratio
+
+    ratio = measure(0, 0.0)
+    if not ratio > _SURE_RATIO:
+        return True
+    return ratio <= MAX_FRONT_RATIO and all(
+        measure(axis, turn) > _TURNED * ratio for axis in (0, 1) for turn in (_TURN, -_TURN)
+    )
 
 
 def _score_frame(inputs: AlignmentInput, frame: Similarity, samples: int = _COMPARED_GAUSSIANS) -> float:

@@ -68,10 +68,10 @@ def find_keypoints(scene: Scene) -> list[PhotoKeypoints]:
         K = cameras.Ks[view].astype(np.float64)
         viewmat = cameras.viewmats[view].astype(np.float64)
         picture, picture_K = _read_picture(scene, view, K)
-        picture_pixels, descriptors = _detect_keypoints(picture, picture_K[1, 1] / picture_K[0, 0])
+        picture_pixels, descriptors = detect_keypoints(picture, picture_K[1, 1] / picture_K[0, 0])
         focal_ratios = K[0, 0] / picture_K[0, 0], K[1, 1] / picture_K[1, 1]
         pixels = (picture_pixels - picture_K[:2, 2]) * focal_ratios + K[:2, 2]
-        z, is_surface = _depths_at(scene, view, viewmat, pixels)
+        z, is_surface = depths_at(_front_depths(scene, view, viewmat), pixels)
         rays = matmul(np.concatenate([pixels, np.ones((len(pixels), 1))], 1), invert(K).T)
         points = matmul(rays[is_surface] * z[is_surface, None] - viewmat[:3, 3], viewmat[:3, :3])
         photos.append(PhotoKeypoints(pixels[is_surface], points, descriptors[is_surface], viewmat, K))
@@ -92,11 +92,15 @@ def _read_picture(scene: Scene, view: int, K: np.ndarray) -> tuple[np.ndarray, n
         scale = np.array([[size[0] / large.width], [size[1] / large.height], [1.0]])
         small = cv2.resize(photo, size, interpolation=cv2.INTER_AREA) if share < 1 else photo
         return small, large.Ks[view].astype(np.float64) * scale
-    colors = row_pictures(scene)[view] if scene.images is None else scene.images[view]
-    return (colors.clip(0, 1) * 255).round().astype(np.uint8), K
+    return to_bytes(row_pictures(scene)[view] if scene.images is None else scene.images[view]), K
 
 
-def _detect_keypoints(picture: np.ndarray, stretch: float) -> tuple[np.ndarray, np.ndarray]:
+def to_bytes(picture: np.ndarray) -> np.ndarray:
+    """Convert a picture in [0, 1] to uint8."""
+    return (picture.clip(0, 1) * 255).round().astype(np.uint8)
+
+
+def detect_keypoints(picture: np.ndarray, stretch: float) -> tuple[np.ndarray, np.ndarray]:
     """Find keypoints of a picture ``[h,w,3]`` uint8; return their pixels ``[n,2]`` and descriptors ``[n,128]``.
 
     ``stretch`` is the width of a pixel's footprint divided by its height. The search resizes the picture to square
@@ -124,12 +128,18 @@ def _detect_keypoints(picture: np.ndarray, stretch: float) -> tuple[np.ndarray, 
     return places * (width / wide, height / high), descriptors
 
 
-def _depths_at(scene: Scene, view: int, viewmat: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the median depth ``[n]`` of 3 x 3 pixels around ``pixels [n,2]``, and whether these show one surface."""
-    # the depth of the front Gaussian of each pixel of the view; infinite without a Gaussian
+def _front_depths(scene: Scene, view: int, viewmat: np.ndarray) -> np.ndarray:
+    """Return the depth ``[h,w]`` of the front Gaussian of each pixel of a view; infinite without a Gaussian."""
     rows = scene.get_pixels().fronts[view]
     depths = camera_depths(scene.gaussians.means[rows].astype(np.float64), viewmat)
-    depths = np.where((rows >= 0) & (depths > 0), depths, np.inf)
+    return np.where((rows >= 0) & (depths > 0), depths, np.inf)
+
+
+def depths_at(depths: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the median of the depths ``[h,w]`` in 3 x 3 pixels around ``pixels [n,2]``, and if these are one surface.
+
+    Depths are infinite where there is no surface.
+    """
     padded = np.pad(depths, 1, mode="edge")
     height, width = depths.shape
     x = np.floor(pixels[:, 0]).astype(int).clip(0, width - 1)
@@ -152,23 +162,26 @@ def match_photos(
     second-best match.
     """
     pairs = [(a, b) for a in photos for b in other_photos]
-    rows = []  # of each pair of photos: the keypoints of the first that have a match, and their matches in the second
-    for a, b in ((a.descriptors, b.descriptors) for a, b in pairs):
-        if min(len(a), len(b)) < 2:  # without a second-best match nothing can be decided
-            rows.append((np.empty(0, int), np.empty(0, int)))
-            continue
-        # all sums are whole numbers below 2^24, so float32 is exact in any order of summation
-        distances = (a * a).sum(1)[:, None] + (b * b).sum(1) - 2 * (a @ b.T)
-        best = distances.argmin(1)
-        two_best = np.partition(distances, 1, axis=1)[:, :2].astype(np.float64)
-        is_clear = two_best[:, 0] < MATCH_RATIO**2 * two_best[:, 1]
-        matched = is_clear & (distances.argmin(0)[best] == np.arange(len(a)))
-        rows.append((np.flatnonzero(matched), best[matched]))
+    # of each pair of photos: the keypoints of the first that have a match, and their matches in the second
+    rows = [match_descriptors(a.descriptors, b.descriptors) for a, b in pairs]
     first = _make_side([a for a, _ in pairs], [ids for ids, _ in rows])
     second = _make_side([b for _, b in pairs], [ids for _, ids in rows])
     diagonal = float(np.sqrt(size[0] ** 2 + size[1] ** 2))
     pixel_spread = 0.003  # standard deviation of a keypoint, divided by the diagonal of the picture
     return KeypointMatches(scenes, (first, second), pixel_spread * diagonal)
+
+
+def match_descriptors(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the keypoints ``[m]`` of one photo that have a match, and their matches ``[m]`` in another photo."""
+    if min(len(a), len(b)) < 2:  # without a second-best match nothing can be decided
+        return np.empty(0, int), np.empty(0, int)
+    # all sums are whole numbers below 2^24, so float32 is exact in any order of summation
+    distances = (a * a).sum(1)[:, None] + (b * b).sum(1) - 2 * (a @ b.T)
+    best = distances.argmin(1)
+    two_best = np.partition(distances, 1, axis=1)[:, :2].astype(np.float64)
+    is_clear = two_best[:, 0] < MATCH_RATIO**2 * two_best[:, 1]
+    matched = is_clear & (distances.argmin(0)[best] == np.arange(len(a)))
+    return np.flatnonzero(matched), best[matched]
 
 
 def _make_side(photos: Sequence[PhotoKeypoints], rows: Sequence[np.ndarray]) -> MatchSide:

@@ -1,0 +1,56 @@
+"""Cameras in any other frame than the Gaussians are found by keypoints, and a mirrored scene is named."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scenes
+from tiny_scene import rotation
+
+from gsmerge import Cameras, Scene
+from gsmerge.method.geometry.transforms import Similarity
+from gsmerge.reading.alignment.registration.localise import find_frames
+from gsmerge.reading.alignment.score import AlignmentInput
+from gsmerge.reading.alignment.unaligned import is_mirrored
+
+WIDTH, HEIGHT = 160, 120
+
+
+@pytest.fixture(scope="module")
+def room() -> Scene:
+    return scenes.make_scene(scenes.room(), scenes.arc(6, WIDTH, HEIGHT))
+
+
+def inputs_of(scene: Scene, cameras: Cameras) -> AlignmentInput:
+    valid = np.ones(len(scene.gaussians), bool)
+    return AlignmentInput(scene.gaussians, valid, cameras, np.asarray(scene.images))
+
+
+def turned(cameras: Cameras, degrees: tuple[float, float, float], scale: float = 1.0) -> Cameras:
+    """Return cameras of a world that was turned about its axes, scaled and shifted."""
+    world = Similarity(rotation(*np.deg2rad(degrees)), scale, np.array([0.4, -0.2, 0.3]) * (scale != 1))
+    return world.move_cameras(cameras)
+
+
+@pytest.mark.parametrize(("degrees", "scale"), [((5.0, 0.0, 2.0), 1.0), ((100.0, -30.0, 70.0), 1.7)])
+def test_cameras_of_a_turned_world_are_found(room: Scene, degrees: tuple[float, float, float], scale: float) -> None:
+    cameras = turned(room.cameras, degrees, scale)
+    frames = list(find_frames(inputs_of(room, cameras)))
+    errors = [np.abs(frame.move_cameras(cameras).viewmats - room.cameras.viewmats).max() for frame in frames]
+    assert min(errors) < 0.04  # a pixel is 0.012
+    assert "rotated by" in frames[0].description
+
+
+def test_photos_of_another_scene_show_no_frame(room: Scene) -> None:
+    other = scenes.make_scene([scenes.plane(3.0, scenes.waves(5))], scenes.arc(6, WIDTH, HEIGHT))
+    assert not list(find_frames(inputs_of(replace(room, images=other.images), room.cameras)))
+
+
+def test_a_mirrored_scene_is_named(room: Scene) -> None:
+    g = room.gaussians
+    flipped = replace(g, means=g.means * np.float32([-1, 1, 1]), quats=g.quats * np.float32([1, 1, -1, -1]))
+    assert is_mirrored(inputs_of(replace(room, gaussians=flipped), room.cameras))
+    assert not is_mirrored(inputs_of(room, room.cameras))
+    assert not is_mirrored(replace(inputs_of(room, room.cameras), images=np.zeros((0, HEIGHT, WIDTH, 3))))
