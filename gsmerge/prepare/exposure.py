@@ -65,27 +65,27 @@ FARTHER_VIEWS = 2
 
 
 @dataclass(frozen=True, eq=False)
-class _Pair:
-    """Measured ratio of brightness between two views, from surfaces that both show."""
+class Ratio:
+    """Measured ratio of k values between two views, such as three colours, from surfaces that both show."""
 
     view: int
     other: int
-    ratios: np.ndarray  # [3] median, over the pixels, of the logarithm of the other view's colour over this view's
+    ratios: np.ndarray  # [k] median, over the pixels, of the logarithm of the other view's values over this view's
     count: int  # number of pixels
 
 
 def equalise_exposure(scene: PicturedScene, views: Sequence[int], exposure: Exposure) -> tuple[PicturedScene, str]:
     """Divide each view's photo and its pixels' Gaussians by the exposure gain of the view, if that is needed.
 
-    The photos of ``views`` show the scene, and each Gaussian belongs to one view. Clipped pixels of brighter photos no
-    longer count if another photo shows their surface unclipped. Also returns a sentence that says so, "" if nothing
-    changes. The record of the run gets the choice ``exposure``, the gain of each view in red, green and blue. If
-    exposures differ but photos stay unchanged, a note says why.
+    The photos of ``views`` show the scene. Gaussians that belong to no view keep their colours. Clipped pixels of
+    brighter photos no longer count if another photo shows their surface unclipped. Also returns a sentence that says
+    so, "" if nothing changes. The record of the run gets the choice ``exposure``, the gain of each view in red, green
+    and blue. If exposures differ but photos stay unchanged, a note says why.
     """
     if exposure == "fixed" or len(views) < 2:
         return scene, ""
     pairs = _measure_pairs(scene, views)
-    gains = _solve_gains(pairs, len(scene))
+    gains = solve_gains(pairs, len(scene))
     factors = exp(gains).round(3)
     low = factors.min()
     high = factors.max()
@@ -108,7 +108,8 @@ def equalise_exposure(scene: PicturedScene, views: Sequence[int], exposure: Expo
             note(f"{differ}; photos stay unchanged, because {objection}; {remedy}")
             return scene, ""
     record_choices(exposure=factors.tolist())
-    change = f"{differ}: photos, and the Gaussians of their pixels, are brought to their mean exposure"
+    with_rows = "photos, and the Gaussians of their pixels," if scene.has_own_pixels else "photos"
+    change = f"{differ}: {with_rows} are brought to their mean exposure"
     return _divide_by_gains(scene, factors), change
 
 
@@ -181,7 +182,7 @@ def collect_surfaces(scene: Scene) -> Surfaces:
     return Surfaces(scene.cameras, scene.gaussians.means.take(fronts, axis=0), valid)
 
 
-def _measure_pairs(scene: PicturedScene, views: Sequence[int]) -> list[_Pair]:
+def _measure_pairs(scene: PicturedScene, views: Sequence[int]) -> list[Ratio]:
     """Measure the ratios of colours between pairs of ``views`` that show the same surfaces."""
     size = scene.pixels_per_view
     pixels = collect_surfaces(scene)
@@ -189,10 +190,10 @@ def _measure_pairs(scene: PicturedScene, views: Sequence[int]) -> list[_Pair]:
     sample = np.random.default_rng(0).permutation(size)[:EXPOSURE_PIXELS]
     partners = choose_partners(camera_distances(scene.cameras[list(views)]))
 
-    def measure_view(number: int) -> list[_Pair]:
+    def measure_view(number: int) -> list[Ratio]:
         """Measure the ratios of colours between one of ``views`` and the views with which it is compared."""
         view = views[number]
-        pairs = list[_Pair]()
+        pairs = list[Ratio]()
         rows = sample[pixels.valid[view, sample]]
         min_pixels = 60  # least number of shared pixels from which a ratio is measured
         for other in (views[partner] for partner in partners[number]):
@@ -205,7 +206,7 @@ def _measure_pairs(scene: PicturedScene, views: Sequence[int]) -> list[_Pair]:
             usable = red & green & blue
             if usable.sum() >= min_pixels:
                 ratios = log(there[usable].astype(np.float64) / here[usable])
-                pairs.append(_Pair(view, other, medians(ratios), len(ratios)))
+                pairs.append(Ratio(view, other, medians(ratios), len(ratios)))
         return pairs
 
     return [pair for pairs in parallel_map(measure_view, range(len(views))) for pair in pairs]
@@ -224,10 +225,10 @@ def choose_partners(distances: np.ndarray) -> np.ndarray:
     return np.sort(order, axis=1)
 
 
-def _solve_gains(pairs: Sequence[_Pair], num_views: int) -> np.ndarray:
-    """Solve for the logarithmic gains ``[v,3]`` of all views, with mean zero; without pairs all gains are zero."""
+def solve_gains(pairs: Sequence[Ratio], num_views: int) -> np.ndarray:
+    """Solve for the logarithmic gains ``[v,k]`` of all views, with mean zero; without pairs all gains are zero."""
     matrix = np.full((num_views, num_views), 1.0 / num_views)
-    right = np.zeros((num_views, 3))
+    right = np.zeros((num_views, len(pairs[0].ratios) if pairs else 3))
     max_weighted_pixels = 1000  # above this number of shared pixels, the weight of a pair of views does not grow
     for pair in pairs:
         ends = [pair.view, pair.other]
@@ -271,11 +272,11 @@ def _divide_by_gains(scene: PicturedScene, gains: np.ndarray) -> PicturedScene:
         images[view] = (scene.images[view] * factors[view]).clip(0, 1)
 
     parallel_map(divide, range(len(scene)))
-    views = scene.get_pixels().homes // scene.pixels_per_view
-    g = scene.gaussians
-    row_factors = factors[views][:, None]
-    sh0 = rgb_to_sh0(sh0_to_rgb(g.sh0) * row_factors).astype(np.float32)
-    gaussians = replace(g, sh0=sh0, shN=g.shN * row_factors)
+    gaussians = scene.gaussians
+    if scene.has_own_pixels:
+        row_factors = factors[scene.get_pixels().homes // scene.pixels_per_view][:, None]
+        sh0 = rgb_to_sh0(sh0_to_rgb(gaussians.sh0) * row_factors).astype(np.float32)
+        gaussians = replace(gaussians, sh0=sh0, shN=gaussians.shN * row_factors)
     large = None if scene.large_photos is None else change_large(scene.large_photos, changes)
     new_masks = scene.masks if masks.all() else masks
     return replace(scene, images=images, gaussians=gaussians, masks=new_masks, large_photos=large)

@@ -208,7 +208,7 @@ def give_input_pictures(p: Prepared, _: PrepareOptions) -> Prepared:
 
 def equalise_exposures(p: Prepared, options: PrepareOptions) -> Prepared:
     """Bring photos, and the Gaussians of their pixels, to one exposure if exposures differ at random."""
-    if not p.scene.has_own_pixels:
+    if p.scene.pixels is None or not p.reference.of_views:
         return p
     scene, change = equalise_exposure(p.scene, p.reference.score_views, options.exposure)
     return p.after(change, scene=scene)

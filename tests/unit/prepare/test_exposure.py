@@ -24,6 +24,7 @@ from gsmerge.prepare.exposure import (
     share_unexpected,
 )
 from gsmerge.prepare.photo_change import CLIPPED
+from gsmerge.prepare.true_pixels import with_pixels
 from gsmerge.runtime.record import record_run
 
 VIEWS = range(5)
@@ -115,3 +116,15 @@ def test_clipped_pixels_do_not_count_where_other_photos_show_more(scene: Scene) 
     assert masks[0, clipped].mean() < 0.1  # borders and edges are seen by no other
     assert masks[0, ~clipped].all()
     assert masks[1:].all()
+
+
+def test_photos_beside_gaussians_of_no_pixels_are_brought_to_one_exposure(scene: Scene) -> None:
+    factors = elementary.exp(np.array([0.25, -0.2, 0.2, -0.25, 0.0]))[:, None, None, None].astype(np.float32)
+    points = with_pixels(replace(scene, pixels=None))
+    images = (0.6 * scene.images * factors).clip(0, 1)
+    even, change = equalise_exposure(replace(points, images=images), VIEWS, "auto")
+    assert even.gaussians is points.gaussians
+    assert "photos are brought to their mean exposure" in change
+    bright = scene.images > 0.2  # noise of the darkest levels counts nowhere
+    ratios = (even.images / np.maximum(scene.images, 0.05))[bright]
+    np.testing.assert_allclose(ratios / np.median(ratios), 1, atol=0.05)
