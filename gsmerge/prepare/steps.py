@@ -18,6 +18,7 @@ from gsmerge.method.facts.prepared import Prepared, Reference, with_photos
 from gsmerge.method.geometry.frame import Frame, canonicalise
 from gsmerge.method.raster.photos import counting_pixels
 from gsmerge.method.viewpoints.place_cameras import HELD_OUT, describe_dropped, draw_pictures, keep_finite, place_views
+from gsmerge.prepare.blurred import leave_out_blurred
 from gsmerge.prepare.compare_photos import compare_photos
 from gsmerge.prepare.confirm_depths import confirm_depths
 from gsmerge.prepare.draw_left_out import draw_left_out, mask_background
@@ -148,6 +149,13 @@ def drop_overlays(p: Prepared, options: PrepareOptions) -> Prepared:
 def drop_passers_by(p: Prepared, options: PrepareOptions) -> Prepared:
     """Leave out what only one photo shows, and its Gaussians."""
     return p if p.reference.placed or options.look != "auto" else _leave_out(p, *leave_out_passers(p.scene))
+
+
+def drop_blurred(p: Prepared, options: PrepareOptions) -> Prepared:
+    """Leave out blurred photos where sharper ones show the same."""
+    if p.scene.images is None or options.look != "auto":
+        return p
+    return _leave_out(p, *leave_out_blurred(PicturedScene.with_pictures(p.scene, p.scene.images, p.scene.masks)))
 
 
 def leave_out_background(p: Prepared, options: PrepareOptions) -> Prepared:
@@ -296,7 +304,7 @@ def draw_unseen(p: Prepared, _: PrepareOptions) -> Prepared:
 
 
 # Names of the steps that leave out, or follow, what people did to photos, masks and scenes
-RULES = ("masked rows", "vignette", "edits", "overlays", "passers-by")
+RULES = ("masked rows", "vignette", "edits", "overlays", "passers-by", "blurred")
 STEPS: tuple[Step, ...] = (
     Step("repeats", drop_repeats),
     Step("finite", drop_nonfinite),
@@ -309,6 +317,7 @@ STEPS: tuple[Step, ...] = (
     Step("edits", follow_scene_edits),
     Step("overlays", drop_overlays),
     Step("passers-by", drop_passers_by),
+    Step("blurred", drop_blurred),
     Step("background", leave_out_background),
     Step("photos", use_photos),
     Step("row colours", use_row_colors),
