@@ -52,9 +52,9 @@ from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.stages import Look
 from gsmerge.types import PicturedScene
 
-# Signed differences of pixels are averaged over 5 x 5 pixels. If a model blurs a photo by 1.5 pixels, only 0.5 % of the
-# averages differ by EXPOSURE_STEP
-MEAN_WINDOW = np.full(5, 1 / 5, np.float32)
+# Signed differences of pixels are averaged over MEAN_PIXELS x MEAN_PIXELS pixels of the photos that a model saw. If it
+# blurs a photo by 1.5 pixels, only 0.5 % of the averages differ by EXPOSURE_STEP
+MEAN_PIXELS = 5
 TONE_SAMPLE = 1 << 16  # approximate number of pixels and of Gaussians whose colours are compared
 COMPARED_OPACITY = 0.05  # opacity below which a pixel's Gaussian is not compared
 GREY_VARIATION = 0.25  # a photo is grey if its hues vary by less than this share of the Gaussians' variation
@@ -309,9 +309,12 @@ def _find_hidden(scene: PicturedScene, changes: Sequence[PhotoChange]) -> tuple[
     def differ(view: int, picture: np.ndarray, known: np.ndarray) -> np.ndarray:
         """Return a mask of the pixels at which a view's photo differs from ``picture``, in its ``known`` part."""
         weights = known.astype(np.float32)
-        difference = (changes[view](scene.images[view]) - picture) * weights[..., None]
-        red, green, blue = np.moveaxis(np.abs(convolve(difference, MEAN_WINDOW, MEAN_WINDOW)), -1, 0)
-        differs = known & ((red + green + blue) / 3 > EXPOSURE_STEP * convolve(weights, MEAN_WINDOW, MEAN_WINDOW))
+        photo = changes[view](scene.images[view])
+        if spacing > 1:
+            photo = convolve(photo, footprint, footprint)
+        difference = (photo - picture) * weights[..., None]
+        red, green, blue = np.moveaxis(np.abs(convolve(difference, window, window)), -1, 0)
+        differs = known & ((red + green + blue) / 3 > EXPOSURE_STEP * convolve(weights, window, window))
         return fill_gaps(differs[..., None], known)[..., 0]
 
     def compare_drawn(views: np.ndarray, drawn: RowPicture) -> None:
@@ -325,6 +328,11 @@ def _find_hidden(scene: PicturedScene, changes: Sequence[PhotoChange]) -> tuple[
     pictures, pixels = row_pictures(scene), scene.get_pixels()
     shown = pixels.shown
     with_row = shown & (scene.gaussians.opacities[pixels.fronts] > COMPARED_OPACITY) & inside
+    # Beside photos that are larger than those a model saw, only some pixels have a row, with the mean colour of the
+    # pixels around it
+    beside = (with_row[..., 1:] & with_row[..., :-1]).sum()
+    spacing = round(float(np.sqrt(with_row.size / max(1, with_row.sum())))) if 2 * beside < with_row.sum() else 1
+    footprint, window = (np.full(side | 1, 1 / (side | 1), np.float32) for side in (spacing, MEAN_PIXELS * spacing))
     hidden = np.stack(parallel_map(lambda view: differ(view, pictures[view], with_row[view]), range(len(scene))))
     picture_rows(scene, compare_drawn, np.asarray((hidden | ~inside).any((1, 2))))
     return hidden, pictures

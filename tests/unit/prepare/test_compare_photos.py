@@ -29,9 +29,11 @@ from gsmerge.method.compare.colors import (
 from gsmerge.method.compare.view_pictures import Pairs, ViewPictures
 from gsmerge.method.facts.pictures import PHOTOS, ROW_COLORS
 from gsmerge.method.geometry.transforms import rgb_to_sh0, sh0_to_rgb
+from gsmerge.method.geometry.views import take_rows
 from gsmerge.prepare.compare_photos import are_exchanged, compare_photos, find_grey, have_other_tones
 from gsmerge.prepare.photo_change import LUMA, PhotoChange
 from gsmerge.prepare.prepare_scene import prepare
+from gsmerge.prepare.true_pixels import with_pixels
 from gsmerge.runtime.record import record_run
 from gsmerge.types import PicturedScene
 
@@ -275,3 +277,18 @@ def test_photos_stay_beside_gaussians_that_draw_them_dark(opacity: float, size: 
     assert prepared.reference.score_views == (0, 1, 2, 3)
     assert not noted(record.notes, "tone")
     assert np.abs(prepared.scene.images - room.images).mean() < 0.01
+
+
+def test_photos_that_are_larger_and_sharper_than_those_of_the_model_show_the_scene(room: Scene) -> None:
+    """Rows lie in the middle of 3 x 3 pixels, and have their mean colour."""
+    grain = np.random.default_rng(0).uniform(-0.3, 0.3, (*room.images.shape[:3], 1)).astype(np.float32)
+    images = (0.25 + 0.5 * room.images + grain).clip(0, 1)
+    means = images.reshape(4, 24, 3, 32, 3, 3).mean((2, 4))
+    rows = np.arange(4 * 72 * 96).reshape(4, 72, 96)[:, 1::3, 1::3].reshape(-1)
+    few = take_rows(with_pixels(replace(room, images=images)), rows)
+    sparse = replace(few, gaussians=replace(few.gaussians, sh0=rgb_to_sh0(means.reshape(-1, 1, 3))))
+    with record_run():
+        scene, views, changes = compare_photos(PicturedScene.with_pictures(sparse, images, None))
+    assert views == (0, 1, 2, 3)
+    assert not any(changes)
+    np.testing.assert_array_equal(scene.images, images)
