@@ -219,3 +219,13 @@ def test_rows_far_from_their_pixels_are_doubted(tmp_path: Path, share: float, is
     loaded = load_scene(save_export(tmp_path / "scene", SMOOTH, rows))
     assert loaded.scene.has_own_pixels
     assert noted(loaded.doubts, "far from their own pixels", "copy or export it again") == is_doubt
+
+
+def test_files_that_may_be_cameras_of_an_unknown_layout_are_named(tmp_path: Path) -> None:
+    save_export(tmp_path, SMOOTH, export_rows(SMOOTH, KINDS["voxels"]))
+    (tmp_path / "transforms.json").unlink()
+    (tmp_path / "my_rig.json").write_text('{"cams": [{"mat": [1, 2]}]}')
+    (tmp_path / "README.txt").write_text("a scene")
+    notes = load_scene(tmp_path).notes
+    assert noted(notes, "are not used", "no cameras", "my_rig.json")
+    assert not noted(notes, "README.txt")
