@@ -19,6 +19,7 @@ from gsmerge.method.kernels.elementary import exp, log
 from gsmerge.method.kernels.pictures import blur
 from gsmerge.method.raster.photos import counting_pixels, row_pictures
 from gsmerge.prepare.exposure import Ratio, Surfaces, choose_partners, collect_surfaces, solve_gains
+from gsmerge.prepare.photo_change import LOOK_OF_PHOTOS
 from gsmerge.runtime.record import list_some
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import PicturedScene
@@ -87,7 +88,7 @@ def leave_out_blurred(scene: PicturedScene) -> tuple[PicturedScene, np.ndarray |
     change = (
         f"{is_blurred.sum()} of {len(views)} photos are blurred (down to {100 * least:.0f} % of the usual contrast of"
         f" the same surfaces): left out where sharper photos show the same, {100 * gone[is_blurred].mean():.0f} % of"
-        f" them ({names})"
+        f" them ({names}; {LOOK_OF_PHOTOS})"
     )
     goes = np.zeros(len(scene.gaussians), bool)
     if scene.has_own_pixels:

@@ -55,6 +55,7 @@ from gsmerge.types import PicturedScene
 # Signed differences of pixels are averaged over MEAN_PIXELS x MEAN_PIXELS pixels of the photos that a model saw. If it
 # blurs a photo by 1.5 pixels, only 0.5 % of the averages differ by EXPOSURE_STEP
 MEAN_PIXELS = 5
+LEAST_JUDGED = 0.25  # share of a photo's pixels that count from which it is judged as a whole
 TONE_SAMPLE = 1 << 16  # approximate number of pixels and of Gaussians whose colours are compared
 COMPARED_OPACITY = 0.05  # opacity below which a pixel's Gaussian is not compared
 GREY_VARIATION = 0.25  # a photo is grey if its hues vary by less than this share of the Gaussians' variation
@@ -73,11 +74,16 @@ def compare_photos(scene: PicturedScene, look: Look = "auto") -> tuple[PicturedS
     if look != "auto" or not photo_views:
         return scene, tuple(photo_views) if look != "scene" else (), []
     pairs = pair_photos(scene, scene.images)
-    grey = find_grey(pairs, photo_views)
+    # what is left of a photo of which most does not count, as of a blurred one, is too little to judge it
+    shares = counting_pixels(scene).mean((1, 2))
+    judged = [view for view in photo_views if shares[view] >= LEAST_JUDGED] or photo_views
+    grey = find_grey(pairs, judged)
     if grey:
         scene = _color_photos(scene, grey)
         pairs = pair_photos(scene, scene.images)
-    matching = find_matching_views(scene, photo_views, list(scene.images), pairs.shown)
+    matching = find_matching_views(scene, judged, list(scene.images), pairs.shown)
+    if matching:
+        matching = sorted({*matching, *photo_views} - ({*judged} - {*matching}))
     compared_views = matching or photo_views
     if _has_other_look(scene, pairs, compared_views):
         problem = "the scene has another look than its photos, so it keeps its own colours"

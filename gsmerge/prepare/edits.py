@@ -19,7 +19,7 @@ from gsmerge.method.kernels.pictures import convolve
 from gsmerge.method.raster import render
 from gsmerge.method.raster.photos import COVERED_TRANSMITTANCE, counting_pixels
 from gsmerge.prepare.compare_photos import COMPARED_OPACITY
-from gsmerge.prepare.photo_change import PhotoChange, change_large
+from gsmerge.prepare.photo_change import KEEP, PhotoChange, change_large
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import PicturedScene, Pixels, Scene
 
@@ -97,7 +97,7 @@ def follow_edits(scene: Scene) -> tuple[Scene, str]:
     covered = sum(int(change.cover.sum()) for change in changes if change.cover is not None)
     change = (
         f"the scene was edited after the photos were taken, at {100 * covered / masks.size:.1f} % of their pixels:"
-        " drawings of the scene replace the photos there (--set look=photos keeps the photos)"
+        f" drawings of the scene replace the photos there{KEEP}"
     )
     if scene.masks is not None or not masks.all():
         scene = replace(scene, masks=masks)

@@ -19,6 +19,7 @@ from gsmerge.method.geometry.transforms import project
 from gsmerge.method.geometry.views import even_views, take_rows
 from gsmerge.method.kernels.pictures import blur, sample_bilinear, sobel
 from gsmerge.method.raster.photos import counting_pixels
+from gsmerge.prepare.photo_change import KEEP
 from gsmerge.types import PicturedScene
 
 LEAST_VIEWS = 4  # of fewer photos, chance makes two alike
@@ -84,7 +85,7 @@ def leave_out_overlays(scene: PicturedScene) -> tuple[PicturedScene, np.ndarray 
         goes[within[within >= 0]] = True
         goes[beyond[beyond >= 0]] = False
     where = f"{100 * overlay.mean():.1f} % of their pixels ({_describe_place(part)})"
-    change = f"all photos show the same at {where}: taken for an overlay, and left out with its Gaussians"
+    change = f"all photos show the same at {where}: taken for an overlay, and left out with its Gaussians{KEEP}"
     scene = replace(scene, masks=counting_pixels(scene) & ~overlay)
     return take_rows(scene, np.flatnonzero(~goes)), overlay, change
 

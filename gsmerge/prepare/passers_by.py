@@ -18,6 +18,7 @@ from gsmerge.method.geometry.transforms import camera_depths, median, nearest_vi
 from gsmerge.method.geometry.views import even_views, resize_cameras, take_rows
 from gsmerge.method.raster.photos import counting_pixels
 from gsmerge.prepare.confirm_depths import SAME_LOG_DEPTH
+from gsmerge.prepare.photo_change import KEEP
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, PicturedScene, Scene
 
@@ -75,7 +76,7 @@ def leave_out_passers(scene: Scene) -> tuple[Scene, np.ndarray | None, str]:
     count = int(gone.any((1, 2)).sum())
     change = (
         f"{count} of {len(views)} photos show something that is in no other, at {100 * gone.mean():.1f} % of all"
-        " pixels: it is left out with its Gaussians"
+        f" pixels, perhaps people or things that moved: it is left out with its Gaussians{KEEP}"
     )
     return take_rows(replace(scene, masks=counting & ~gone), np.flatnonzero(~rows)), gone, change
 

@@ -12,6 +12,8 @@ from gsmerge.method.compare.colors import map_tones
 from gsmerge.types import LargePhotos
 
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)  # brightness of red, green and blue, as in JPEGs (Rec. 601)
+LOOK_OF_PHOTOS = "--set look=photos keeps the photos"  # what a user can do about a rule
+KEEP = f" ({LOOK_OF_PHOTOS})"
 CLIPPED = 0.985  # a pixel may be clipped from this level on
 
 

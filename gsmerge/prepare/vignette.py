@@ -22,7 +22,7 @@ from gsmerge.method.kernels.matrices import solve
 from gsmerge.method.kernels.pictures import sample_bilinear
 from gsmerge.method.raster.photos import counting_pixels
 from gsmerge.prepare.exposure import CLIPPED_LEVEL, NOISE_LEVEL, choose_partners, collect_surfaces
-from gsmerge.prepare.photo_change import PhotoChange, change_large
+from gsmerge.prepare.photo_change import KEEP, PhotoChange, change_large
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import PicturedScene
 
@@ -108,8 +108,8 @@ def divide_by_vignette(scene: PicturedScene) -> tuple[PicturedScene, np.ndarray 
     scene = replace(scene, images=images, large_photos=large, masks=counting_pixels(scene) & ~black)
     scene = replace(scene, gaussians=replace(g, sh0=sh0, shN=g.shN * factors))
     said = (
-        f"the light of all photos falls off to {100 * light.min():.0f} % of that at the brightest pixels: photos, and"
-        " the Gaussians of their pixels, are divided by it"
+        f"all photos end in a dark ring (a vignette, down to {100 * light.min():.0f} % of the light): photos, and the"
+        f" Gaussians of their pixels, are divided by the light{KEEP}"
     )
     if not black.any():
         return scene, black, said

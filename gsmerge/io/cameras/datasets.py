@@ -75,6 +75,11 @@ def read_easyvolcap(source: CameraSource) -> StoredCameras:
     check_camera_count(folder / INTRI, len(names))
     views = list[StoredView]()
     for name in names:
+        if f"T_{name}" not in extri or not {f"Rot_{name}", f"R_{name}"} & extri.keys():
+            problem = (
+                f"camera {name}: expected Rot_{name} or R_{name}, and T_{name}, as {INTRI} has K_{name}, found none"
+            )
+            raise SceneError(folder / EXTRI, problem, f"add them, or take K_{name} out of {INTRI}")
         with number_errors(folder / EXTRI, f"camera {name}: expected Rot_{name} or R_{name}, and T_{name}"):
             stored = extri.get(f"Rot_{name}")
             rotation = rotation_of_vector(extri[f"R_{name}"]) if stored is None else stored.reshape(3, 3)

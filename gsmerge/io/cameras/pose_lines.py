@@ -90,11 +90,11 @@ def _read_kitti(path: Path) -> _Intrinsics:
         if name.startswith("P") and len(numbers.split(maxsplit=12)) == 12:
             with number_errors(path, f"{name}: expected numbers"):
                 projections[name.strip()] = np.array(numbers.split(), np.float64).reshape(3, 4)
-    cameras = [camera for camera in _KITTI_CAMERAS if f"P{camera}" in projections]
-    if not cameras:
-        raise SceneError(path, "expected a line P2 with 12 numbers, as in KITTI's odometry, found none")
-    shown = [camera for camera in cameras if (path.parent / f"image_{camera}").is_dir()]
-    projection = projections[f"P{(shown or cameras)[0]}"]
+    shown = [camera for camera in _KITTI_CAMERAS if (path.parent / f"image_{camera}").is_dir()]
+    name = f"P{(shown or _KITTI_CAMERAS)[0]}"
+    if name not in projections:
+        raise SceneError(path, f"expected a line {name} with 12 numbers, as in KITTI's odometry, found none")
+    projection = projections[name]
     offset = np.eye(4)
     with number_errors(path, "expected intrinsics"):
         offset[:3, 3] = matmul(invert(projection[:, :3]), projection[:, 3])

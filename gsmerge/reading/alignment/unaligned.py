@@ -282,6 +282,8 @@ def _check_colors(inputs: AlignmentInput, cameras: Cameras, name: str, no_pixels
     ``name`` describes the cameras in words. The message begins with the problem of ``no_pixels``.
     """
     ratio = check_cameras(inputs.gaussians, inputs.valid, cameras, inputs.images, foremost=True).color_ratio
+    if ratio > MAX_FRONT_RATIO and is_mirrored(inputs):
+        raise UnseenError(no_pixels.path, f"{no_pixels.problem}; {MIRRORED}", UNMIRROR)
     if ratio > MAX_FRONT_RATIO:
         measured = (
             f"even with cameras {name} the colours of the foremost Gaussians are {ratio:.2f} times as far from the"

@@ -47,7 +47,7 @@ def test_photos_and_gaussians_are_divided_by_the_light_of_a_ring(room: Scene) ->
     before = np.abs(room.images * light[..., None] - room.images)[:, bright].mean()
     after = np.abs(scene.images - room.images)[:, bright].mean()
     assert after < before / 3
-    assert "falls off" in change
+    assert "dark ring" in change
     assert len(scene.gaussians) == len(room.gaussians) - black.sum()
     assert not scene.masks[black].any()
     colors = sh0_to_rgb(scene.gaussians.sh0[:, 0]).clip(0, 1)
@@ -89,6 +89,6 @@ def test_dark_corners_without_shared_surfaces_are_no_ring(room: Scene) -> None:
 def test_the_step_keeps_the_photos_if_it_is_asked_to(room: Scene) -> None:
     scene = darkened(room, falloff(1.35))
     done = prepare(scene, PrepareOptions())
-    assert any("falls off" in change for change in done.changes)
+    assert any("dark ring" in change for change in done.changes)
     kept = prepare(scene, PrepareOptions(look="photos"))
-    assert not any("falls off" in change for change in kept.changes)
+    assert not any("dark ring" in change for change in kept.changes)

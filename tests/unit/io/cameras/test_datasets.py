@@ -140,7 +140,7 @@ def test_a_camera_of_easyvolcap_has_the_first_photo_of_its_folder_and_its_lens(t
         (write_realestate, "0a1b.txt", "1001 ", "", ("0a1b.txt: line 3", "19 numbers")),
         (write_realestate, "0a1b.txt", "1001 ", "1001 1 ", ("0a1b.txt: line 3", "19 numbers")),
         (write_realestate, "0a1b.txt", " 0.0 0.0 ", " a b ", ("0a1b.txt: line 2", "'a'")),
-        (write_easyvolcap, "extri.yml", "T_01", "t_01", ("extri.yml: camera 01", "T_01")),
+        (write_easyvolcap, "extri.yml", "T_01", "t_01", ("extri.yml: camera 01", "T_01", "found none", "intri.yml")),
         (write_easyvolcap, "extri.yml", "rows: 3", "rows: 2", ("extri.yml: R_00",)),
         (write_easyvolcap, "intri.yml", "rows: 3", "rows: 9", ("intri.yml: K_00", "9 x 3")),
         (write_easyvolcap, "intri.yml", "K_0", "k_0", ("extri.yml", "at least one")),
