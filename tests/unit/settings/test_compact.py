@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+import uuid
 from collections.abc import Callable
 from dataclasses import asdict, fields, is_dataclass, replace
 from pathlib import Path
@@ -154,8 +155,9 @@ def test_settings_have_the_types_of_their_fields() -> None:
 
 @pytest.mark.slow  # mypy reads the package, which takes half a minute
 def test_a_type_checker_refuses_settings_that_do_not_exist(tmp_path: Path) -> None:
-    (tmp_path / "calls.py").write_text(CALLS)
-    call = [sys.executable, "-m", "mypy", "--strict", "--no-error-summary", str(tmp_path / "calls.py")]
+    calls = tmp_path / f"calls_{uuid.uuid4().hex}.py"  # a cache of mypy would name an earlier file of this name
+    calls.write_text(CALLS)
+    call = [sys.executable, "-m", "mypy", "--strict", "--no-error-summary", str(calls)]
     lines = subprocess.run(call, capture_output=True, text=True, check=False).stdout.splitlines()
     wrong = {line.split(":")[1] for line in lines if line.startswith(str(tmp_path)) and ": error: " in line}
     assert wrong == {"4", "5", "7"}
