@@ -18,15 +18,14 @@ from gsmerge.method.geometry.views import take_rows
 from gsmerge.method.kernels.elementary import exp, log
 from gsmerge.method.kernels.pictures import blur
 from gsmerge.method.raster.photos import counting_pixels, row_pictures
-from gsmerge.prepare.exposure import Ratio, Surfaces, choose_partners, collect_surfaces, solve_gains
 from gsmerge.prepare.photo_change import LOOK_OF_PHOTOS
+from gsmerge.prepare.surfaces import LEAST_SHARED, Ratio, Surfaces, collect_surfaces, solve_gains
 from gsmerge.runtime.record import list_some
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import PicturedScene
 
 LEAST_VIEWS = 4  # of fewer photos, most may be blurred
 COMPARED_PIXELS = 2000  # of a photo, whose surfaces are looked up in other photos
-LEAST_SHARED = 60  # surfaces from which a ratio is measured
 LEAST_PAIRS = 3  # other photos with which a blurred one is compared
 FINE = 1.0  # standard deviation of the blur that takes the fine contrast away, pixels
 AROUND = 2.0  # standard deviation of the window in which contrast is measured, pixels
@@ -38,7 +37,7 @@ BLURRED = 0.45
 # A blurred photo has less contrast as a whole, too, unless it shows more texture than the others: if no photo has less
 # than WHOLE of the median, none is blurred
 WHOLE = 0.75
-LINES = 4
+LINES = 4  # every LINES-th line shows the contrast of a photo as a whole
 NEIGHBOURS = 8  # sharp photos in which the surfaces of blurred ones are looked up
 SQUARE = np.ones((5, 5), np.uint8)
 
@@ -48,10 +47,11 @@ def leave_out_blurred(scene: PicturedScene) -> tuple[PicturedScene, np.ndarray |
 
     Also returns these pixels ``[v,h,w]`` bool, None if no photo is blurred, and a sentence.
     """
-    views = scene.photo_views
     if scene.pixels is None:
         return scene, None, ""
-    views = [view for view in views if scene.images[view].std() > LEAST_CONTRAST]  # a black photo is not blurred
+    views = [
+        view for view in scene.photo_views if scene.images[view].std() > LEAST_CONTRAST
+    ]  # a black photo is not blurred
     if len(views) < LEAST_VIEWS:
         return scene, None, ""
     quick = np.array([_measure_fine(scene.images[view]) for view in views])
@@ -60,29 +60,21 @@ def leave_out_blurred(scene: PicturedScene) -> tuple[PicturedScene, np.ndarray |
     surfaces = collect_surfaces(scene)
     ratios = _measure_ratios(scene, views, surfaces)
     sharpness = solve_gains(ratios, len(scene))[:, 0]
-    sharpness -= median(sharpness[list(views)])
+    sharpness -= median(sharpness[views])
     counts = np.bincount([ratio.view for ratio in ratios], minlength=len(scene))
     is_blurred = (sharpness < float(log(BLURRED))) & (counts >= LEAST_PAIRS)
     if not is_blurred.any():
         return scene, None, ""
     sharp = [view for view in views if not is_blurred[view]]
     order = order_others(camera_distances(scene.cameras))
-    shape = scene.images.shape[1:3]
-
-    def find_shown(view: int) -> np.ndarray:
-        """Return a mask ``[h,w]`` of the pixels of a view whose surfaces sharp photos show."""
-        rows = np.flatnonzero(surfaces.valid[view])
-        is_shown = np.zeros(shape[0] * shape[1], np.uint8)
-        for other in [other for other in order[view].tolist() if other in sharp][:NEIGHBOURS]:
-            is_shown[rows[surfaces.look_up(view, rows, other)[0]]] = 1
-            rows = rows[is_shown[rows] == 0]
-        closed = cv2.morphologyEx(is_shown.reshape(shape), cv2.MORPH_CLOSE, SQUARE)
-        return cv2.morphologyEx(closed, cv2.MORPH_OPEN, SQUARE) > 0
-
-    gone = np.zeros(scene.images.shape[:3], bool)
+    counting = counting_pixels(scene)
+    gone = np.zeros_like(counting)
     for view in np.flatnonzero(is_blurred).tolist():
-        gone[view] = find_shown(view)
-    gone &= counting_pixels(scene)
+        nearest = [other for other in order[view].tolist() if other in sharp][:NEIGHBOURS]
+        shown = surfaces.find_shown(view, counting[view].reshape(-1), nearest, surfaces.valid)
+        closed = cv2.morphologyEx(shown.reshape(counting[view].shape).astype(np.uint8), cv2.MORPH_CLOSE, SQUARE)
+        gone[view] = cv2.morphologyEx(closed, cv2.MORPH_OPEN, SQUARE) > 0
+    gone &= counting
     names = list_some([scene.names[view] for view in np.flatnonzero(is_blurred)])
     least = exp(sharpness[is_blurred]).min()
     change = (
@@ -98,7 +90,7 @@ def leave_out_blurred(scene: PicturedScene) -> tuple[PicturedScene, np.ndarray |
             own = median(_measure_contrast(pictures[view])[gone[view]])
             if own * BLURRED > median(_measure_contrast(scene.images[view])[gone[view]]):  # a sharper photo made them
                 goes &= scene.get_pixels().homes // scene.pixels_per_view != view
-    scene = replace(scene, masks=counting_pixels(scene) & ~gone)
+    scene = replace(scene, masks=counting & ~gone)
     return take_rows(scene, np.flatnonzero(~goes)) if goes.any() else scene, gone, change
 
 
@@ -119,23 +111,16 @@ def _measure_ratios(scene: PicturedScene, views: Sequence[int], surfaces: Surfac
     """Measure the ratios of contrasts between pairs of photos that show the same surfaces."""
     measured = parallel_map(lambda view: _measure_contrast(scene.images[view]).reshape(-1), views)
     contrasts = dict(zip(views, measured, strict=True))
-    sample = np.random.default_rng(0).permutation(scene.pixels_per_view)[:COMPARED_PIXELS]
-    partners = choose_partners(camera_distances(scene.cameras[list(views)]))
     least = np.float32(0.1 * LEAST_CONTRAST)  # keeps logarithms finite
 
-    def measure_view(number: int) -> list[Ratio]:
-        """Measure the ratios between one of ``views`` and the views with which it is compared."""
-        view = views[number]
-        found = list[Ratio]()
-        rows = sample[surfaces.valid[view, sample]]
-        for other in (views[partner] for partner in partners[number]):
-            shared, other_rows = surfaces.look_up(view, rows, other)
-            here = contrasts[view][rows[shared]]
-            there = contrasts[other][other_rows]
-            is_textured = np.maximum(here, there) > LEAST_CONTRAST
-            if is_textured.sum() >= LEAST_SHARED:
-                values = log((there + least).astype(np.float64) / (here + least))[is_textured]
-                found.append(Ratio(view, other, np.array([median(values)]), len(values)))
-        return found
+    def measure(view: int, other: int, rows: np.ndarray, other_rows: np.ndarray) -> Ratio | None:
+        """Measure the ratio of contrasts between two views."""
+        here = contrasts[view][rows]
+        there = contrasts[other][other_rows]
+        is_textured = np.maximum(here, there) > LEAST_CONTRAST
+        if is_textured.sum() < LEAST_SHARED:
+            return None
+        values = log((there + least).astype(np.float64) / (here + least))[is_textured]
+        return Ratio(view, other, np.array([median(values)]), len(values))
 
-    return [ratio for found in parallel_map(measure_view, range(len(views))) for ratio in found]
+    return surfaces.compare(views, COMPARED_PIXELS, measure)

@@ -14,6 +14,7 @@ from gsmerge.method.facts.agreement import CONFIRM_PIXELS, Agreement
 from gsmerge.method.geometry.frame import scene_depth
 from gsmerge.method.geometry.transforms import camera_depths, nearest_views, project
 from gsmerge.method.kernels.elementary import log
+from gsmerge.prepare.surfaces import SAME_LOG_DEPTH
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Scene
 
@@ -22,7 +23,6 @@ CONFIRM_NEIGHBORS = 16  # nearest other views in which the sampled pixels are lo
 # but at least AGREEMENT_PIXELS
 AGREEMENT_SHARE = 1 / 120
 AGREEMENT_PIXELS = 1.5
-SAME_LOG_DEPTH = 0.05  # difference of the logarithms of two depths of one surface
 LEAST_DEPTH = 1e-9  # least depth, canonical units
 # Parts of pictures, as ranges of columns and of rows in thirds. A part is poor if the share of its pixels that other
 # views contradict, or the share that no other view sees, is above POOR_PART_SHARE

@@ -18,7 +18,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gsmerge.frozen import dataclass, replace
+from gsmerge.frozen import replace
 from gsmerge.method.geometry.transforms import (
     camera_distances,
     correlation,
@@ -28,14 +28,12 @@ from gsmerge.method.geometry.transforms import (
     sh0_to_rgb,
 )
 from gsmerge.method.kernels.elementary import exp, log
-from gsmerge.method.kernels.matrices import solve
-from gsmerge.method.kernels.reproject import find_surfaces
-from gsmerge.method.raster.photos import NEAR_PLANE
 from gsmerge.prepare.photo_change import CLIPPED, PhotoChange, change_large
+from gsmerge.prepare.surfaces import LEAST_SHARED, Ratio, collect_surfaces, solve_gains
 from gsmerge.runtime.record import note, record_choices
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.stages import Exposure
-from gsmerge.types import Cameras, PicturedScene, Scene
+from gsmerge.types import PicturedScene
 
 EXPOSURE_PIXELS = 2000  # pixels of a view that are looked up in the other views
 # colours in between are neither noise nor clipped
@@ -59,19 +57,6 @@ UNEXPECTED = 0.69
 COARSE_STEP = 4  # the brightness of a photo is measured on every COARSE_STEP-th pixel of every COARSE_STEP-th row
 BRIGHT_GAIN = 1.15  # clipped pixels do not count in photos with a gain above BRIGHT_GAIN
 CLIPPED_NEIGHBOURS = 8  # views in which the surfaces of clipped pixels are looked up
-# Numbers of nearest views and of farther views with which a view is compared; see choose_partners
-NEAREST_VIEWS = 6
-FARTHER_VIEWS = 2
-
-
-@dataclass(frozen=True, eq=False)
-class Ratio:
-    """Measured ratio of k values between two views, such as three colours, from surfaces that both show."""
-
-    view: int
-    other: int
-    ratios: np.ndarray  # [k] median, over the pixels, of the logarithm of the other view's values over this view's
-    count: int  # number of pixels
 
 
 def equalise_exposure(scene: PicturedScene, views: Sequence[int], exposure: Exposure) -> tuple[PicturedScene, str]:
@@ -143,101 +128,24 @@ def share_unexpected(gains: np.ndarray, distances: np.ndarray) -> float:
     return float(np.sqrt((offsets * offsets).mean()) / max(expected, 1e-9))
 
 
-@dataclass(frozen=True, eq=False)
-class Surfaces:
-    """For each pixel, the centre of the Gaussian in front, and whether the pixel counts."""
-
-    cameras: Cameras
-    means: np.ndarray  # [v,h*w,3] canonical units
-    valid: np.ndarray  # [v,h*w] bool, True for pixels that count
-
-    def look_up(self, view: int, rows: np.ndarray, other: int) -> tuple[np.ndarray, np.ndarray]:
-        """Find which of the pixels ``rows`` of a view show a surface that another view shows, too.
-
-        Returns indices into ``rows``, and the pixels at which the other view shows the surface.
-        """
-        viewmat = self.cameras.viewmats[other].astype(np.float64)
-        K = self.cameras.Ks[other].astype(np.float64)
-        same_depth = 0.05  # difference of the logarithms of two depths of one surface
-        return find_surfaces(
-            self.means[view],
-            rows,
-            self.means[other],
-            self.valid[other],
-            viewmat,
-            K,
-            self.cameras.width,
-            NEAR_PLANE,
-            same_depth,
-        )
-
-
-def collect_surfaces(scene: Scene) -> Surfaces:
-    """Collect the pixels of a scene; pixels without a Gaussian and pixels outside masks do not count."""
-    shape = len(scene), scene.pixels_per_view
-    fronts = scene.get_pixels().fronts.reshape(shape)
-    valid = fronts >= 0
-    if scene.masks is not None:
-        valid = valid & scene.masks.reshape(shape)
-    return Surfaces(scene.cameras, scene.gaussians.means.take(fronts, axis=0), valid)
-
-
 def _measure_pairs(scene: PicturedScene, views: Sequence[int]) -> list[Ratio]:
     """Measure the ratios of colours between pairs of ``views`` that show the same surfaces."""
-    size = scene.pixels_per_view
-    pixels = collect_surfaces(scene)
-    photos = scene.images.reshape(len(scene), size, 3)
-    sample = np.random.default_rng(0).permutation(size)[:EXPOSURE_PIXELS]
-    partners = choose_partners(camera_distances(scene.cameras[list(views)]))
+    photos = scene.images.reshape(len(scene), scene.pixels_per_view, 3)
 
-    def measure_view(number: int) -> list[Ratio]:
-        """Measure the ratios of colours between one of ``views`` and the views with which it is compared."""
-        view = views[number]
-        pairs = list[Ratio]()
-        rows = sample[pixels.valid[view, sample]]
-        min_pixels = 60  # least number of shared pixels from which a ratio is measured
-        for other in (views[partner] for partner in partners[number]):
-            shared, other_rows = pixels.look_up(view, rows, other)
-            here = photos[view].take(rows[shared], axis=0)
-            there = photos[other].take(other_rows, axis=0)
-            red, green, blue = (
-                (here > NOISE_LEVEL) & (here < CLIPPED_LEVEL) & (there > NOISE_LEVEL) & (there < CLIPPED_LEVEL)
-            ).T
-            usable = red & green & blue
-            if usable.sum() >= min_pixels:
-                ratios = log(there[usable].astype(np.float64) / here[usable])
-                pairs.append(Ratio(view, other, medians(ratios), len(ratios)))
-        return pairs
+    def measure(view: int, other: int, rows: np.ndarray, other_rows: np.ndarray) -> Ratio | None:
+        """Measure the ratio of colours between two views."""
+        here = photos[view].take(rows, axis=0)
+        there = photos[other].take(other_rows, axis=0)
+        red, green, blue = (
+            (here > NOISE_LEVEL) & (here < CLIPPED_LEVEL) & (there > NOISE_LEVEL) & (there < CLIPPED_LEVEL)
+        ).T
+        usable = red & green & blue
+        if usable.sum() < LEAST_SHARED:
+            return None
+        ratios = log(there[usable].astype(np.float64) / here[usable])
+        return Ratio(view, other, medians(ratios), len(ratios))
 
-    return [pair for pairs in parallel_map(measure_view, range(len(views))) for pair in pairs]
-
-
-def choose_partners(distances: np.ndarray) -> np.ndarray:
-    """Choose the views ``[v,p]``, ascending, with which each view is compared: all others, or p of them.
-
-    ``distances [v,v]`` are between cameras. The nearest views share the most surfaces. Farther views, at equal steps in
-    the order of distance, connect groups of cameras that stand apart.
-    """
-    order = order_others(distances)
-    if order.shape[1] > NEAREST_VIEWS + FARTHER_VIEWS:
-        steps = np.linspace(NEAREST_VIEWS, order.shape[1] - 1, FARTHER_VIEWS).round().astype(int)
-        order = order[:, [*range(NEAREST_VIEWS), *steps]]
-    return np.sort(order, axis=1)
-
-
-def solve_gains(pairs: Sequence[Ratio], num_views: int) -> np.ndarray:
-    """Solve for the logarithmic gains ``[v,k]`` of all views, with mean zero; without pairs all gains are zero."""
-    matrix = np.full((num_views, num_views), 1.0 / num_views)
-    right = np.zeros((num_views, len(pairs[0].ratios) if pairs else 3))
-    max_weighted_pixels = 1000  # above this number of shared pixels, the weight of a pair of views does not grow
-    for pair in pairs:
-        ends = [pair.view, pair.other]
-        weight = np.sqrt(min(pair.count, max_weighted_pixels))
-        matrix[np.ix_(ends, ends)] += weight * np.array([[1, -1], [-1, 1]])
-        right[ends] += weight * np.array([-pair.ratios, pair.ratios])
-    matrix[np.diag_indices(num_views)] += 1e-6  # views without pairs get a gain of one
-    gains: np.ndarray = solve(matrix, right)
-    return gains
+    return collect_surfaces(scene).compare(views, EXPOSURE_PIXELS, measure)
 
 
 def _divide_by_gains(scene: PicturedScene, gains: np.ndarray) -> PicturedScene:
@@ -247,20 +155,11 @@ def _divide_by_gains(scene: PicturedScene, gains: np.ndarray) -> PicturedScene:
     clipped in all photos, such as a sky, is not masked, because otherwise no photo would show it.
     """
     clipped = ((scene.images >= CLIPPED) & (gains[:, None, None] > BRIGHT_GAIN)).any(-1)
-    pixels, flat = collect_surfaces(scene), clipped.reshape(len(scene), -1)
+    surfaces = collect_surfaces(scene)
+    flat = clipped.reshape(len(scene), -1)
     order = order_others(camera_distances(scene.cameras))[:, :CLIPPED_NEIGHBOURS]
-
-    def find_shown(view: int) -> np.ndarray:
-        """Return a mask ``[h*w]`` of the clipped pixels of a view whose surface another view shows unclipped."""
-        rows = np.flatnonzero(flat[view] & pixels.valid[view])
-        is_shown = np.zeros_like(flat[view])
-        for other in order[view]:
-            shared, other_rows = pixels.look_up(view, rows, other)
-            is_shown[rows[shared[~flat[other, other_rows]]]] = True
-            rows = rows[~is_shown[rows]]
-        return is_shown
-
-    masks = ~np.stack(parallel_map(find_shown, range(len(scene)))).reshape(clipped.shape)
+    shown = parallel_map(lambda view: surfaces.find_shown(view, flat[view], order[view], ~flat), range(len(scene)))
+    masks = ~np.stack(shown).reshape(clipped.shape)
     if scene.masks is not None:
         masks &= scene.masks
     factors = (1 / gains).astype(np.float32)

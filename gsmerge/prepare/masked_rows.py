@@ -20,7 +20,7 @@ from gsmerge.method.raster import TiledView
 from gsmerge.method.raster.composite import composite
 from gsmerge.method.raster.images import tile_views
 from gsmerge.method.raster.photos import COVERED_TRANSMITTANCE, counting_pixels
-from gsmerge.prepare.confirm_depths import SAME_LOG_DEPTH
+from gsmerge.prepare.surfaces import SAME_LOG_DEPTH
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Scene
 

@@ -17,8 +17,8 @@ from gsmerge.method.compare.view_pictures import fit_size
 from gsmerge.method.geometry.transforms import camera_depths, median, nearest_views, project
 from gsmerge.method.geometry.views import even_views, resize_cameras, take_rows
 from gsmerge.method.raster.photos import counting_pixels
-from gsmerge.prepare.confirm_depths import SAME_LOG_DEPTH
 from gsmerge.prepare.photo_change import KEEP
+from gsmerge.prepare.surfaces import SAME_LOG_DEPTH
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, PicturedScene, Scene
 

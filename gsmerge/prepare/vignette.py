@@ -15,14 +15,15 @@ import numpy as np
 from gsmerge.frozen import dataclass, replace
 from gsmerge.method.compare.similarity import stands_out
 from gsmerge.method.compare.view_pictures import fit_size
-from gsmerge.method.geometry.transforms import camera_distances, median, rgb_to_sh0, sh0_to_rgb
+from gsmerge.method.geometry.transforms import median, rgb_to_sh0, sh0_to_rgb
 from gsmerge.method.geometry.views import even_views, take_rows
 from gsmerge.method.kernels.elementary import exp, log
 from gsmerge.method.kernels.matrices import solve
 from gsmerge.method.kernels.pictures import sample_bilinear
 from gsmerge.method.raster.photos import counting_pixels
-from gsmerge.prepare.exposure import CLIPPED_LEVEL, NOISE_LEVEL, choose_partners, collect_surfaces
+from gsmerge.prepare.exposure import CLIPPED_LEVEL, NOISE_LEVEL
 from gsmerge.prepare.photo_change import KEEP, PhotoChange, change_large
+from gsmerge.prepare.surfaces import collect_surfaces
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import PicturedScene
 
@@ -166,26 +167,19 @@ def _find_light(scene: PicturedScene, views: Sequence[int]) -> np.ndarray | None
 
 def _compare_surfaces(scene: PicturedScene, views: Sequence[int]) -> _Quotients:
     """Compare the brightnesses of surfaces that each of ``views`` shows with those in other photos."""
-    surfaces = collect_surfaces(scene)
-    sample = np.random.default_rng(0).permutation(scene.pixels_per_view)[:PIXELS]
-    partners = choose_partners(camera_distances(scene.cameras[list(views)]))
     brightness = scene.images.mean(-1).reshape(len(scene), -1)
 
-    def compare(number: int) -> list[_Quotients]:
-        """Compare one of the photos with its partners."""
-        found = list[_Quotients]()
-        rows = sample[surfaces.valid[views[number], sample]]
-        for other in (views[partner] for partner in partners[number]):
-            shared, there = surfaces.look_up(views[number], rows, other)
-            pair = np.stack([brightness[views[number]][rows[shared]], brightness[other][there]])
-            usable = ((pair > NOISE_LEVEL) & (pair < CLIPPED_LEVEL)).all(0)
-            if usable.any():
-                values = log(pair[0, usable].astype(np.float64) / pair[1, usable])
-                numbers = np.full(len(values), number)
-                found.append(_Quotients(rows[shared][usable], there[usable], values - median(values), numbers))
-        return found
+    def compare(view: int, other: int, rows: np.ndarray, other_rows: np.ndarray) -> _Quotients | None:
+        """Compare two photos."""
+        pair = np.stack([brightness[view][rows], brightness[other][other_rows]])
+        usable = ((pair > NOISE_LEVEL) & (pair < CLIPPED_LEVEL)).all(0)
+        if not usable.any():
+            return None
+        values = log(pair[0, usable].astype(np.float64) / pair[1, usable])
+        numbers = np.full(len(values), views.index(view))
+        return _Quotients(rows[usable], other_rows[usable], values - median(values), numbers)
 
-    found = [one for some in parallel_map(compare, range(len(views))) for one in some]
+    found = collect_surfaces(scene).compare(views, PIXELS, compare)
     if not found:
         nothing = np.zeros(0, np.int64)
         return _Quotients(nothing, nothing, np.zeros(0), nothing)

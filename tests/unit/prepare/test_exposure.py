@@ -13,17 +13,15 @@ from gsmerge.method.geometry.frame import canonicalise
 from gsmerge.method.geometry.transforms import camera_distances
 from gsmerge.method.kernels import elementary
 from gsmerge.prepare.exposure import (
-    FARTHER_VIEWS,
     FOLLOWS,
-    NEAREST_VIEWS,
     UNEXPECTED,
-    choose_partners,
     equalise_exposure,
     is_metered,
     root_mean_square,
     share_unexpected,
 )
 from gsmerge.prepare.photo_change import CLIPPED
+from gsmerge.prepare.surfaces import FARTHER_VIEWS, NEAREST_VIEWS, choose_partners
 from gsmerge.prepare.true_pixels import with_pixels
 from gsmerge.runtime.record import record_run
 
@@ -60,7 +58,7 @@ def test_each_of_few_views_is_compared_with_all_others_and_of_many_with_some() -
 
 def test_gains_of_many_views_are_solved_from_some_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("NEAREST_VIEWS", "FARTHER_VIEWS"):
-        monkeypatch.setattr(f"gsmerge.prepare.exposure.{name}", 4)
+        monkeypatch.setattr(f"gsmerge.prepare.surfaces.{name}", 4)
     count = 16
     scene, _ = canonicalise(scenes.make_scene(scenes.room(), scenes.arc(count, 24, 16)))
     gains = grey(*np.random.default_rng(0).uniform(-0.2, 0.2, count))
