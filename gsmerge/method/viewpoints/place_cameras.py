@@ -130,7 +130,7 @@ def place_inside(gaussians: Gaussians) -> Cameras | None:
     radii = viewer.free_radius * power(np.arange(NUM_VIEWS) * GOLDEN / np.pi % 1, 1 / 3)
     eyes = viewer.place + radii[:, None] * spread_directions(NUM_VIEWS)[::-1]
     viewmats = np.stack(
-        [_look_along(eye, direction) for eye, direction in zip(eyes, spread_directions(NUM_VIEWS), strict=True)]
+        [look_along(eye, direction) for eye, direction in zip(eyes, spread_directions(NUM_VIEWS), strict=True)]
     )
     return Cameras(viewmats, np.repeat(_square_intrinsics(size, INSIDE_FIELD)[None], NUM_VIEWS, 0), size, size)
 
@@ -171,7 +171,7 @@ def place_around(gaussians: Gaussians, count: int = FITTED) -> Cameras:
     directions = cos(angles)[:, None] * along + sin(angles)[:, None] * side
     walk_share = 0.6  # largest distance from the middle, as a share of the longest half axis
     walk = [
-        _look_along(middle + step * walk_share * half.max() * along, direction)
+        look_along(middle + step * walk_share * half.max() * along, direction)
         for step, direction in zip(steps, directions, strict=True)
     ]
     viewmats = np.concatenate([*outside, chosen.viewmats, walk])
@@ -246,7 +246,7 @@ def place_cameras(gaussians: Gaussians, num_views: int = NUM_VIEWS) -> Cameras:
     sample = thin_out(gaussians, CANDIDATE_GAUSSIANS)
     centre, half = _robust_box(sample.means.astype(np.float64))
     inside = [
-        _look_along(centre + position * half, direction)
+        look_along(centre + position * half, direction)
         for position in np.stack(np.meshgrid(INSIDE, INSIDE, INSIDE, indexing="ij"), -1).reshape(-1, 3)
         for direction in spread_directions(INSIDE_DIRECTIONS)
     ]
@@ -284,10 +284,10 @@ def _viewmats_around(centre: np.ndarray, half: np.ndarray, radii: float, directi
     diagonal of the box.
     """
     distance = radii * float(np.sqrt((half * half).sum()))
-    return np.stack([_look_along(centre + distance * direction, -direction) for direction in directions])
+    return np.stack([look_along(centre + distance * direction, -direction) for direction in directions])
 
 
-def _look_along(eye: np.ndarray, direction: np.ndarray) -> np.ndarray:
+def look_along(eye: np.ndarray, direction: np.ndarray) -> np.ndarray:
     """Return the world-to-camera matrix ``[4,4]``, OpenCV axes, of a camera at ``eye`` that looks along ``direction``.
 
     ``direction`` has length 1.

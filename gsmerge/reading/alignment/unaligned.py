@@ -250,7 +250,7 @@ def choose_cameras(
     if frame is not None:
         _check_colors(inputs, frame.move_cameras(inputs.cameras), frame.description, no_pixels)
         return replace(grid, frame=frame, shown_by="photos' colours"), None, []
-    if is_mirrored(inputs):
+    if poses is None and is_mirrored(inputs):  # colours of another convention are checked below
         raise UnseenError(no_pixels.path, f"{no_pixels.problem}; {MIRRORED}", UNMIRROR)
     if not check.ok:
         remedy = f"{no_pixels.remedy}, or write their shift (x y z) to offset.txt beside the file"

@@ -71,11 +71,21 @@ def find_keypoints(scene: Scene) -> list[PhotoKeypoints]:
         picture_pixels, descriptors = detect_keypoints(picture, picture_K[1, 1] / picture_K[0, 0])
         focal_ratios = K[0, 0] / picture_K[0, 0], K[1, 1] / picture_K[1, 1]
         pixels = (picture_pixels - picture_K[:2, 2]) * focal_ratios + K[:2, 2]
-        z, is_surface = depths_at(_front_depths(scene, view, viewmat), pixels)
-        rays = matmul(np.concatenate([pixels, np.ones((len(pixels), 1))], 1), invert(K).T)
-        points = matmul(rays[is_surface] * z[is_surface, None] - viewmat[:3, 3], viewmat[:3, :3])
-        photos.append(PhotoKeypoints(pixels[is_surface], points, descriptors[is_surface], viewmat, K))
+        photos.append(place_keypoints(pixels, descriptors, _front_depths(scene, view, viewmat), viewmat, K))
     return photos
+
+
+def place_keypoints(
+    pixels: np.ndarray, descriptors: np.ndarray, depths: np.ndarray, viewmat: np.ndarray, K: np.ndarray
+) -> PhotoKeypoints:
+    """Return keypoints with the points that a view with ``depths [h,w]`` shows there, but none at edges of surfaces.
+
+    Depths are infinite where there is no surface.
+    """
+    z, is_surface = _depths_at(depths, pixels)
+    rays = matmul(np.concatenate([pixels, np.ones((len(pixels), 1))], 1), invert(K).T)
+    points = matmul(rays[is_surface] * z[is_surface, None] - viewmat[:3, 3], viewmat[:3, :3])
+    return PhotoKeypoints(pixels[is_surface], points, descriptors[is_surface], viewmat, K)
 
 
 def _read_picture(scene: Scene, view: int, K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -135,11 +145,8 @@ def _front_depths(scene: Scene, view: int, viewmat: np.ndarray) -> np.ndarray:
     return np.where((rows >= 0) & (depths > 0), depths, np.inf)
 
 
-def depths_at(depths: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the median of the depths ``[h,w]`` in 3 x 3 pixels around ``pixels [n,2]``, and if these are one surface.
-
-    Depths are infinite where there is no surface.
-    """
+def _depths_at(depths: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the median depth ``[n]`` of 3 x 3 pixels around ``pixels [n,2]``, and whether these show one surface."""
     padded = np.pad(depths, 1, mode="edge")
     height, width = depths.shape
     x = np.floor(pixels[:, 0]).astype(int).clip(0, width - 1)

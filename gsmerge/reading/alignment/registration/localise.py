@@ -20,14 +20,15 @@ from gsmerge.method.kernels.elementary import exp, log
 from gsmerge.method.kernels.matrices import invert, matmul, solve_symmetric, transform
 from gsmerge.method.kernels.pictures import blur, sample_bilinear, sobel
 from gsmerge.method.raster import render
+from gsmerge.method.viewpoints.place_cameras import look_along
 from gsmerge.method.viewpoints.viewer import spread_directions
 from gsmerge.reading.alignment.frames import describe_frame
 from gsmerge.reading.alignment.registration.keypoints import (
     PhotoKeypoints,
-    depths_at,
     detect_keypoints,
     match_descriptors,
     match_photos,
+    place_keypoints,
     to_bytes,
 )
 from gsmerge.reading.alignment.registration.register import compose, connect, invert_similarity, round_similarity
@@ -49,7 +50,6 @@ SIZED = 3000  # Gaussians from whose sizes the viewers' place is searched
 DIRECTIONS = 96  # from the middle of the Gaussians
 PLACES = 2  # most different ones at which viewers may have been
 DISTANCES = (0.5, 1.0, 1.5, 2.5)  # from there, in median distances of the Gaussians
-ROUNDS = 10  # of weighted least squares
 
 
 def find_frames(inputs: AlignmentInput) -> Iterator[Similarity]:
@@ -162,10 +162,7 @@ def _draw_keypoints(gaussians: Gaussians, viewpoints: Cameras) -> list[PhotoKeyp
         viewmat = viewpoints.viewmats[view].astype(np.float64)
         pixels, descriptors = detect_keypoints(to_bytes(drawn.images[view]), 1.0)
         depths = np.where(drawn.alphas[view, ..., 0] > SOLID, drawn.depths[view, ..., 0], np.inf).astype(np.float64)
-        z, is_surface = depths_at(depths, pixels)
-        rays = matmul(np.concatenate([pixels, np.ones((len(pixels), 1))], 1), invert(K).T)
-        places = matmul(rays[is_surface] * z[is_surface, None] - viewmat[:3, 3], viewmat[:3, :3])
-        drawings.append(PhotoKeypoints(pixels[is_surface], places, descriptors[is_surface], viewmat, K))
+        drawings.append(place_keypoints(pixels, descriptors, depths, viewmat, K))
     return drawings
 
 
@@ -274,10 +271,5 @@ def _look_around(eye: np.ndarray, middle: np.ndarray, cameras: Cameras) -> Camer
     K = cameras.Ks[:1].astype(np.float64)
     slant = 0.5 * cameras.width / K[0, 0, 0]
     directions = [ahead, *(ahead + slant * sign * way for way in (side, above) for sign in (1, -1))]
-    viewmats = np.tile(np.eye(4), (len(directions), 1, 1))
-    for viewmat, direction in zip(viewmats, directions, strict=True):
-        z = normalize(direction[None])[0]
-        x = normalize(np.cross(above, z)[None])[0]
-        viewmat[:3, :3] = np.stack([x, np.cross(z, x), z])
-        viewmat[:3, 3] = -matmul(viewmat[:3, :3], eye)
+    viewmats = np.stack([look_along(eye, normalize(direction[None])[0]) for direction in directions])
     return replace(cameras[[0]], viewmats=viewmats, Ks=np.repeat(K, len(viewmats), 0))
