@@ -83,7 +83,7 @@ def compare_photos(scene: PicturedScene, look: Look = "auto") -> tuple[PicturedS
         pairs = pair_photos(scene, scene.images)
     matching = find_matching_views(scene, judged, list(scene.images), pairs.shown)
     if matching:
-        matching = sorted({*matching, *photo_views} - ({*judged} - {*matching}))
+        matching = [view for view in photo_views if view in matching or view not in judged]
     compared_views = matching or photo_views
     if _has_other_look(scene, pairs, compared_views):
         problem = "the scene has another look than its photos, so it keeps its own colours"

@@ -8,6 +8,7 @@ and deleted Gaussians leave pixels without Gaussians. Where a scene was edited, 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import cv2
@@ -64,7 +65,7 @@ def follow_edits(scene: Scene) -> tuple[Scene, str]:
     if edited.mean() > MOST_EDITED:
         return scene, ""
     shares = _measure_shares(pictured, rows, edited)
-    is_dense = 2 * sum(_find_large(share > DENSE).any() for share in shares) >= len(views)
+    is_dense = _are_dense(shares)
     left = np.zeros(scene.images.shape[:3], bool)  # pixels whose own Gaussians are gone
     if is_dense and scene.has_own_pixels:
         pixels, left = _move_homes(pictured)
@@ -264,7 +265,12 @@ def _measure_lost(scene: PicturedScene, rows: np.ndarray) -> list[np.ndarray]:
         return np.where((labels > 0) & np.isin(labels, border), 0, share)
 
     shares = parallel_map(measure, scene.photo_views)
-    return shares if 2 * sum(_find_large(share > DENSE).any() for share in shares) >= len(shares) else []
+    return shares if _are_dense(shares) else []
+
+
+def _are_dense(shares: Sequence[np.ndarray]) -> bool:
+    """Return whether shares ``[h,w]`` are dense in a large part of at least half of the photos."""
+    return 2 * sum(bool(_find_large(share > DENSE).any()) for share in shares) >= len(shares)
 
 
 def _find_large(mask: np.ndarray) -> np.ndarray:

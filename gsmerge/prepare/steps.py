@@ -41,12 +41,15 @@ from gsmerge.types import PicturedScene, Scene
 WORLD = Frame(np.zeros(3), 1.0)  # the frame of a scene as it was read
 
 
+StepFunction = Callable[[Prepared, PrepareOptions], Prepared]
+
+
 @dataclass(frozen=True)
 class Step:
     """One step of preparing a scene."""
 
     name: str
-    take: Callable[[Prepared, PrepareOptions], Prepared]
+    take: StepFunction
 
 
 def begin(scene: Scene, frame: Frame | None = None) -> Prepared:
@@ -124,11 +127,19 @@ def drop_masked_rows(p: Prepared, _: PrepareOptions) -> Prepared:
     return _leave_out(p, *drop_masked(p.scene))
 
 
-def remove_vignette(p: Prepared, options: PrepareOptions) -> Prepared:
-    """Divide photos, and the Gaussians of their pixels, by light that falls off to a dark ring."""
-    if p.scene.images is None or options.look != "auto":
-        return p
-    return _leave_out(p, *divide_by_vignette(PicturedScene.with_pictures(p.scene, p.scene.images, p.scene.masks)))
+def leave_out_by(rule: Callable[[PicturedScene], tuple[Scene, np.ndarray | None, str]]) -> StepFunction:
+    """Return a step that applies a rule to the photos, unless a look was asked for.
+
+    The rule returns the scene without what it leaves out, these pixels ``[v,h,w]`` or None, and a sentence.
+    """
+
+    def apply(p: Prepared, options: PrepareOptions) -> Prepared:
+        """Apply the rule."""
+        if p.scene.images is None or options.look != "auto":
+            return p
+        return _leave_out(p, *rule(PicturedScene.with_pictures(p.scene, p.scene.images, p.scene.masks)))
+
+    return apply
 
 
 def follow_scene_edits(p: Prepared, options: PrepareOptions) -> Prepared:
@@ -137,25 +148,6 @@ def follow_scene_edits(p: Prepared, options: PrepareOptions) -> Prepared:
         return p
     scene, change = follow_edits(p.scene)
     return p.after(change, scene=scene) if change else p
-
-
-def drop_overlays(p: Prepared, options: PrepareOptions) -> Prepared:
-    """Leave out what all photos show at the same pixels, and its Gaussians."""
-    if p.scene.images is None or options.look != "auto":
-        return p
-    return _leave_out(p, *leave_out_overlays(PicturedScene.with_pictures(p.scene, p.scene.images, p.scene.masks)))
-
-
-def drop_passers_by(p: Prepared, options: PrepareOptions) -> Prepared:
-    """Leave out what only one photo shows, and its Gaussians."""
-    return p if p.reference.placed or options.look != "auto" else _leave_out(p, *leave_out_passers(p.scene))
-
-
-def drop_blurred(p: Prepared, options: PrepareOptions) -> Prepared:
-    """Leave out blurred photos where sharper ones show the same."""
-    if p.scene.images is None or options.look != "auto":
-        return p
-    return _leave_out(p, *leave_out_blurred(PicturedScene.with_pictures(p.scene, p.scene.images, p.scene.masks)))
 
 
 def leave_out_background(p: Prepared, options: PrepareOptions) -> Prepared:
@@ -313,11 +305,11 @@ STEPS: tuple[Step, ...] = (
     Step("pixels", lambda p, _: p.after("", scene=with_pixels(p.scene))),
     Step("sizes", raise_tiny_sizes),
     Step("masked rows", drop_masked_rows),
-    Step("vignette", remove_vignette),
+    Step("vignette", leave_out_by(divide_by_vignette)),
     Step("edits", follow_scene_edits),
-    Step("overlays", drop_overlays),
-    Step("passers-by", drop_passers_by),
-    Step("blurred", drop_blurred),
+    Step("overlays", leave_out_by(leave_out_overlays)),
+    Step("passers-by", leave_out_by(leave_out_passers)),
+    Step("blurred", leave_out_by(leave_out_blurred)),
     Step("background", leave_out_background),
     Step("photos", use_photos),
     Step("row colours", use_row_colors),

@@ -60,9 +60,9 @@ def is_needed(candidate: Candidate, tried: Sequence[Evidence]) -> bool:
     """Return whether a candidate has to be examined, after those that were ``tried``.
 
     Camera files are examined until one certainly fits, and then in the ways in which its photos fit better. Cameras of
-    the rows are estimated if no file fits, or if rows
-    form more views than the chosen file has cameras. Cameras that the caller named are not replaced if they do not fit,
-    and neither are cameras beside photos that the caller named and that are to blame.
+    the rows are estimated if no file fits, or if rows form more views than the chosen file has cameras. Cameras that
+    the caller named are not replaced if they do not fit, and neither are cameras beside photos that the caller named
+    and that are to blame.
     """
     if not candidate.replaces_files:
         if candidate.way in SHOWN_BY_PHOTOS:
