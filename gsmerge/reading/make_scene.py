@@ -11,8 +11,7 @@ from gsmerge.errors import Doubt, Note, SceneError, attempt, count_words
 from gsmerge.frozen import dataclass, replace
 from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, to_cameras
 from gsmerge.io.cameras.dataparser import read_dataparser
-from gsmerge.io.cameras.foreign import list_unknown
-from gsmerge.io.cameras.read_cameras import holds_cameras
+from gsmerge.io.cameras.read_cameras import list_unread
 from gsmerge.io.formats.read_gaussians import GaussianFile, file_notes
 from gsmerge.io.formats.rows import MAX_STRAY, RESULT_COMMENT
 from gsmerge.io.photo_files import NO_IMAGES, as_floats, photo_size
@@ -77,13 +76,13 @@ def place_no_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> Pl
     notes = [advice] if advice else []
     check_hints(ply, hints)
     if files.images is not None:
-        unknown = [path.name for path in list_unknown(files.ply.parent) if not holds_cameras(path)]
-        which = f" (of {list_some(unknown)}, none has cameras in a format that is read)" if unknown else ""
-        reason = (
-            f"only cameras show which views they have, and --cameras {NONE} leaves cameras out"
-            if "cameras" in files.named
-            else f"there are no cameras, such as a transforms.json or a COLMAP model{which}; name them with --cameras"
-        )
+        reason = f"only cameras show which views they have, and --cameras {NONE} leaves cameras out"
+        if "cameras" not in files.named:
+            unread = [path.name for path in list_unread(files.ply.parent)]
+            which = f" (of {list_some(unread)}, none has cameras in a format that is read)" if unread else ""
+            reason = (
+                f"there are no cameras, such as a transforms.json or a COLMAP model{which}; name them with --cameras"
+            )
         notes += [Note(f"the photos in {files.images} are not used: {reason}", "unused photos")]
     problem = "expected one Gaussian per pixel, found no cameras"
     return Placed(files, AlignmentResult(None, NO_CAMERAS, NO_IMAGES, None, problem=problem), tuple(notes))

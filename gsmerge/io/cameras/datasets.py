@@ -1,4 +1,4 @@
-"""Read the cameras of data sets and simulators: RealEstate10K, EasyVolcap and EasyMocap, and Isaac Sim."""
+"""Read the cameras of EasyVolcap and EasyMocap, and of Isaac Sim."""
 
 from __future__ import annotations
 
@@ -10,16 +10,15 @@ from typing import Any
 import numpy as np
 
 from gsmerge.errors import SceneError
-from gsmerge.io.bounds import read_json, read_lines, read_text
-from gsmerge.io.cameras.camera_file import StoredView, check_camera_count, make_lens, make_pinhole
+from gsmerge.io.bounds import read_json, read_text
+from gsmerge.io.cameras.camera_file import StoredView, check_camera_count, make_lens
 from gsmerge.io.cameras.camera_source import CameraSource, StoredCameras, number_errors
 from gsmerge.io.cameras.foreign import ISAAC_FILES
 from gsmerge.io.cameras.view_layout import Entry, rotation_of_vector
-from gsmerge.io.first_bytes import read_start
 from gsmerge.io.image_names import list_images, natural_order
 
-_LINE_NUMBERS = 19  # numbers in a line of RealEstate10K
 INTRI, EXTRI = "intri.yml", "extri.yml"
+UNKNOWN = np.zeros(1)  # a side in pixels that a file does not have
 # An entry of a file of OpenCV's FileStorage: a matrix, or a number
 _YAML_MATRIX = re.compile(
     r"^(\w[\w.-]*):\s*!!opencv-matrix\s+rows:\s*(\d{1,4})\s+cols:\s*(\d{1,4})\s+dt:\s*\w+\s+"
@@ -27,33 +26,6 @@ _YAML_MATRIX = re.compile(
     re.MULTILINE,
 )
 _YAML_NUMBER = re.compile(r"^(\w[\w.-]*):[ \t]*([-+]?[\d.]+(?:[eE][-+]?\d+)?)[ \t]*\r?$", re.MULTILINE)
-
-
-def is_realestate(path: Path) -> bool:
-    """Return whether a text file has the address of a video, and then cameras, as those of RealEstate10K have."""
-    lines = read_start(path).decode("latin-1").splitlines()
-    return len(lines) > 1 and lines[0].startswith("http") and len(lines[1].split()) == _LINE_NUMBERS
-
-
-def read_realestate(source: CameraSource) -> StoredCameras:
-    """Read the cameras of a video of RealEstate10K.
-
-    After the video's address, a line has the time of a photo, which is its name, then fx, fy, cx and cy divided by the
-    size, two zeros, and the 12 numbers of a world-to-camera pose. Raise SceneError for a damaged line.
-    """
-    views = list[StoredView]()
-    for number, line in enumerate(read_lines(source.path), 1):
-        words = line.split(maxsplit=_LINE_NUMBERS)
-        if number == 1 or not words:
-            continue
-        if len(words) != _LINE_NUMBERS:
-            found = f"expected {_LINE_NUMBERS} numbers, found {len(words)} or more"
-            raise SceneError(source.path, f"line {number}: {found}")
-        with number_errors(source.path, f"line {number}: expected numbers"):
-            numbers = np.array(words[1:], np.float64)
-        views.append(StoredView(words[0], numbers[6:].reshape(3, 4), make_pinhole(*numbers[:4])))
-        check_camera_count(source.path, len(views))
-    return StoredCameras(views)
 
 
 def is_easyvolcap(source: CameraSource) -> bool:
@@ -87,10 +59,7 @@ def read_easyvolcap(source: CameraSource) -> StoredCameras:
         with number_errors(folder / INTRI, f"camera {name}: expected K_{name} of 3 x 3 numbers, and whole sizes"):
             K = intri[f"K_{name}"].reshape(3, 3)
             lens = intri.get(f"D_{name}", intri.get(f"dist_{name}", np.zeros(0))).reshape(-1)[:5].tolist()
-            size = (
-                round(float(intri.get(f"W_{name}", np.zeros(1))[0])),
-                round(float(intri.get(f"H_{name}", np.zeros(1))[0])),
-            )
+            width, height = (round(float(intri.get(f"{side}_{name}", UNKNOWN)[0])) for side in "WH")
         photos = folder / "images" / name
         first = list_images(photos)[:1] if photos.is_dir() else []
         views.append(
@@ -98,7 +67,7 @@ def read_easyvolcap(source: CameraSource) -> StoredCameras:
                 f"{name}/{first[0].stem}" if first else name,
                 pose,
                 K,
-                size if min(size) > 0 else (0, 0),
+                (width, height) if min(width, height) > 0 else (0, 0),
                 make_lens("OPENCV", "perspective", lens),
             )
         )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from contextlib import suppress
 from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
@@ -29,8 +28,6 @@ CALIBRATION = "calib.txt"
 REPLICA_CAMERA = "cam_params.json"
 BESIDE_POSES = (INTRINSICS, CALIBRATION, REPLICA_CAMERA)
 ISAAC_FILES = "camera_params_*.json"  # cameras of Isaac Sim, one in each
-_MAY_BE_CAMERAS = (".json", ".txt", ".xml", ".npz", ".npy", ".yml", ".yaml", ".csv", ".log")
-_OTHER_TEXTS = r"^(readme|licen[sc]e|requirements|config|cfg|args|report|log)|report\.json$|\.cameras\.json$"
 # most levels of folders, and most paths, that are searched for files of PROGRAMS
 _DEPTH = 3
 _MAX_PATHS = 10_000
@@ -110,14 +107,6 @@ def check_program(place: Path) -> None:
         foreign = next(foreign for foreign in PROGRAMS if _is_file_of(path, foreign))
         problem = f"expected cameras of a supported format, found those of {foreign.program}"
         raise SceneError(path, problem, foreign.remedy)
-
-
-def list_unknown(folder: Path) -> list[Path]:
-    """List files of a folder that may be cameras by their endings, of whatever program."""
-    with suppress(OSError):
-        files = sorted(path for path in folder.glob("[!.]*") if path.suffix.lower() in _MAY_BE_CAMERAS)
-        return [path for path in files if path.is_file() and not re.search(_OTHER_TEXTS, path.name, re.IGNORECASE)]
-    return []
 
 
 def find_unread(place: Path) -> Path | None:

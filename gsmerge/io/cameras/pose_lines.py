@@ -1,6 +1,6 @@
 """Read text files with a pose in each line, and the intrinsics beside them.
 
-DA3-Streaming and VGGT-Long write such files, and so do the data sets KITTI and Replica.
+DA3-Streaming and VGGT-Long write such files, and so do the data sets KITTI, Replica and RealEstate10K.
 """
 
 from __future__ import annotations
@@ -17,9 +17,11 @@ from gsmerge.io.bounds import read_json, read_lines
 from gsmerge.io.cameras.camera_file import StoredView, check_camera_count, make_pinhole
 from gsmerge.io.cameras.camera_source import CameraSource, StoredCameras, number_errors, to_number
 from gsmerge.io.cameras.foreign import CALIBRATION, INTRINSICS, REPLICA_CAMERA
+from gsmerge.io.first_bytes import read_start
 from gsmerge.method.kernels.matrices import invert, matmul
 
 _POSE_COLUMNS = (12, 16)  # possible counts of numbers in a line with a pose
+_REALESTATE_COLUMNS = 19  # numbers in a line of RealEstate10K: a time, the lens, two zeros and a pose
 _KITTI_CAMERAS = (2, 3, 0, 1)  # cameras of KITTI, whose photos lie in image_2 and so on, the most preferred first
 
 
@@ -73,6 +75,24 @@ def read_poses(source: CameraSource) -> StoredCameras:
     return StoredCameras(views)
 
 
+def is_realestate(path: Path) -> bool:
+    """Return whether a text file has the address of a video, and then cameras, as those of RealEstate10K have."""
+    lines = read_start(path).decode("latin-1").splitlines()
+    return len(lines) > 1 and lines[0].startswith("http") and len(lines[1].split()) == _REALESTATE_COLUMNS
+
+
+def read_realestate(source: CameraSource) -> StoredCameras:
+    """Read the cameras of a video of RealEstate10K.
+
+    After the video's address, a line has the time of a photo, which is its name, then fx, fy, cx and cy divided by the
+    size, two zeros, and the 12 numbers of a world-to-camera pose. Raise SceneError for a damaged line.
+    """
+    lines = read_lines(source.path)
+    next(lines, None)  # the address
+    rows = _parse(source.path, lines, (_REALESTATE_COLUMNS,), first=2)
+    return StoredCameras([StoredView(f"{row[0]:.0f}", row[7:].reshape(3, 4), make_pinhole(*row[1:5])) for row in rows])
+
+
 def _read_lines_of_intrinsics(path: Path) -> _Intrinsics:
     """Read lines of fx, fy, cx and cy in pixels, of all views or of each."""
     return _Intrinsics([make_pinhole(*row) for row in _parse(path, read_lines(path), lengths=(4,))])
@@ -109,17 +129,18 @@ def _read_replica(path: Path) -> _Intrinsics:
         return _Intrinsics([make_pinhole(fx, fy, cx, cy)], (round(width), round(height)), "frame{:06d}")
 
 
-def _parse(path: Path, lines: Iterable[str], lengths: tuple[int, ...]) -> list[np.ndarray]:
+def _parse(path: Path, lines: Iterable[str], lengths: tuple[int, ...], *, first: int = 1) -> list[np.ndarray]:
     """Parse lines of numbers, and skip empty lines. ``lengths`` are the possible counts of numbers in a line.
 
-    If a line is wrong, SceneError says the line's number.
+    If a line is wrong, SceneError says the line's number; ``first`` is that of the first of ``lines``.
     """
     rows: list[np.ndarray] = []
-    for number, line in enumerate(lines, 1):
-        words = _words(line)
+    most = max(*lengths, _POSE_COLUMNS[-1])
+    for number, line in enumerate(lines, first):
+        words = _words(line, most)
         if words and len(words) not in lengths:
             counts = " or ".join(map(str, lengths))
-            found = len(words) if len(words) <= _POSE_COLUMNS[-1] else f"more than {_POSE_COLUMNS[-1]}"
+            found = len(words) if len(words) <= most else f"more than {most}"
             raise SceneError(path, f"line {number}: expected {counts} numbers, found {found}")
         try:
             rows += [np.array(words, np.float64)] if words else []
@@ -129,6 +150,6 @@ def _parse(path: Path, lines: Iterable[str], lengths: tuple[int, ...]) -> list[n
     return rows
 
 
-def _words(line: str) -> list[str]:
-    """Split a line into as many words as a pose has numbers; if more follow, they are one last word."""
-    return line.split(maxsplit=_POSE_COLUMNS[-1])
+def _words(line: str, most: int = _POSE_COLUMNS[-1]) -> list[str]:
+    """Split a line into at most so many words; if more follow, they are one last word."""
+    return line.split(maxsplit=most)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from gsmerge.errors import SceneError
@@ -31,6 +32,8 @@ holds_images = _lazy("npz_files.holds_images")
 _holds_poses = _lazy("npz_files.holds_poses")
 count_images = _lazy("colmap.count_images")
 _CANDIDATE_ENDINGS = (".json", ".npz", ".xml", ".txt")  # endings of files that may be cameras whatever their name
+_OTHER_ENDINGS = (".npy", ".yml", ".yaml", ".csv", ".log")  # of cameras of other programs
+_OTHER_TEXTS = r"^(readme|licen[sc]e|requirements|config|cfg|args|report|log)|report\.json$"  # which are no cameras
 
 
 def find_cameras(folder: Path) -> Path | None:
@@ -59,17 +62,27 @@ def find_other_cameras(folder: Path) -> Path | None:
 
     Files of intrinsics beside poses, and cameras that gsmerge wrote for viewers, are left out.
     """
-    candidates = [
+    max_candidates = 16  # most files of a folder that are searched for cameras
+    files = [path for path in _list_files(folder, _CANDIDATE_ENDINGS)[:max_candidates] if holds_cameras(path)]
+    return files[0] if len(files) == 1 else None
+
+
+def list_unread(folder: Path) -> list[Path]:
+    """List files of a folder that may be cameras by their endings, of whatever program, but cannot be read so."""
+    files = _list_files(folder, (*_CANDIDATE_ENDINGS, *_OTHER_ENDINGS))
+    return [path for path in files if not re.search(_OTHER_TEXTS, path.name, re.IGNORECASE) and not holds_cameras(path)]
+
+
+def _list_files(folder: Path, endings: Sequence[str]) -> list[Path]:
+    """List files of a folder with one of ``endings``, but no intrinsics beside poses, and no cameras for viewers."""
+    return [
         path
         for path in sorted(folder.glob("[!.]*"))
-        if path.suffix in _CANDIDATE_ENDINGS
+        if path.suffix in endings
         and path.name not in BESIDE_POSES
         and not path.name.endswith(ENDING)
         and path.is_file()
     ]
-    max_candidates = 16  # most files of a folder that are searched for cameras
-    files = [path for path in candidates[:max_candidates] if holds_cameras(path)]
-    return files[0] if len(files) == 1 else None
 
 
 def holds_cameras(path: Path) -> bool:

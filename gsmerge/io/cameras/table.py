@@ -101,7 +101,7 @@ _array_names, _is_da3 = _lazy("npz_files.array_names"), _lazy("npz_files.is_da3"
 _READ_COLMAP = _lazy("colmap.read_colmap")
 _read_da3 = _lazy("npz_files.read_da3")
 _LISTS_POSES = _lazy("pose_lines.lists_poses")
-_IS_REALESTATE, _IS_EASYVOLCAP = _lazy("datasets.is_realestate"), _lazy("datasets.is_easyvolcap")
+_IS_REALESTATE, _IS_EASYVOLCAP = _lazy("pose_lines.is_realestate"), _lazy("datasets.is_easyvolcap")
 _read_state_views = LazyFunction("gsmerge.io.formats.gsm", "read_views")
 
 _TRANSFORMS_JSON = ViewLayout(
@@ -185,7 +185,7 @@ CAMERA_FORMATS = (
     CameraFormat("COLMAP text", "COLMAP: `cameras.txt` and `images.txt`", "", partial(_READ_COLMAP, suffix=".txt"),
                  W2C_OPENCV, "pixels; lenses", lambda file: _holds_model(file.path, ".txt")),
     CameraFormat("RealEstate10K", "`.txt` of RealEstate10K: the video's address, then 19 numbers a line", ".txt",
-                 _lazy("datasets.read_realestate"), W2C_OPENCV, "divided by the size",
+                 _lazy("pose_lines.read_realestate"), W2C_OPENCV, "divided by the size",
                  lambda file: _IS_REALESTATE(file.path)),
     CameraFormat("pose list", "`camera_poses.txt` of DA3-Streaming, VGGT-Long, `poses.txt` of KITTI, `traj.txt` of"
                  " Replica: 12 or 16 numbers a line", ".txt", _lazy("pose_lines.read_poses"), C2W_OPENCV,
