@@ -1,8 +1,8 @@
 """Read and write ``.spz``, a format of quantised columns (github.com/nianticlabs/spz, README and load-spz.cc).
 
 Positions are fixed-point numbers of 24 bits. Log scales are steps of 1/16 from -10 on. Opacities and colours are bytes.
-Rotations are the three smaller components of quaternions, each with a sign and 9 bits. Harmonics are bytes, rounded to
-their 5 highest bits (degree 1) or 4 highest bits. Version 3 is one gzip stream, with harmonics up to degree 3. Version
+Rotations are the three smaller components of quaternions, each with a sign and 9 bits. Harmonics are bytes, which are
+written in steps of ``HARMONIC_STEP``. Version 3 is one gzip stream, with harmonics up to degree 3. Version
 4 has an uncompressed header, a table of compressed and uncompressed sizes, and one Zstandard stream for each column.
 
 The README says that axes point right, up and back. However, Niantic's converters, splat-transform and SuperSplat write
@@ -60,6 +60,11 @@ UNIX = b"\3"
 SCENE_BITS = 14  # bits of a position within the scene: steps of a sixteenth of a pixel if the scene fills 1,000 pixels
 LARGEST_POSITION = 2**23 - 1
 _SHIFTS = (20, 10, 0)  # lowest bits of the three smaller components of a rotation in its word
+# Step of harmonics, in 1/128. With steps of 2, the rounding of harmonics changes pictures as much as that of all other
+# columns together: they are 52.1 dB from those of the scene, with steps of 1 55.0, with 4 47.9, and with Niantic's steps
+# of 8 (degree 1) and 16 38.8. A file of as many bytes has a quarter fewer Gaussians than with Niantic's steps, and shows
+# new views of a glossy room .3 to .5 dB better, whatever its size
+HARMONIC_STEP = 2
 COLOR_SCALE = 0.15  # factor of sh0, so that colours slightly outside [0, 1] can be stored
 # Names of the attributes of Gaussians, in the order of a .spz file
 ATTRIBUTES = ("means", "opacities", "sh0", "scales", "quats", "shN")
@@ -327,7 +332,7 @@ def spz_columns(
 
 
 def _quantise(columns: arrays.Columns, header: Header) -> tuple[np.ndarray, ...]:
-    """Quantise a block of Gaussians to columns of bytes; harmonics in steps of 8 (degree 1) or 16.
+    """Quantise a block of Gaussians to columns of bytes.
 
     Version 2 stores the x, y and z of a rotation as bytes, with signs for which w is positive. Version 3 stores a word
     whose two highest bits are the index of the largest of xyzw. The sign and magnitude of each of the three other
@@ -335,7 +340,6 @@ def _quantise(columns: arrays.Columns, header: Header) -> tuple[np.ndarray, ...]
     """
     fixed = quantise_means(columns.means, header.fraction)
     count, num_higher = columns.harmonics.shape[:2]
-    steps = np.where(np.arange(num_higher) < 3, 8, 16)[:, None]
     if header.version < 3:
         rotations = arrays.to_bytes(127.5 * (np.where(columns.quats[:, :1] < 0, -1, 1) * columns.quats[:, 1:] + 1))
     else:
@@ -346,7 +350,7 @@ def _quantise(columns: arrays.Columns, header: Header) -> tuple[np.ndarray, ...]
         for i, shift in enumerate(_SHIFTS):
             words |= codes[:, i] << np.uint32(shift)
         rotations = words.astype("<u4")[:, None].view(np.uint8)
-    stepped = (np.round(np.clip(columns.harmonics, -2, 2) * 128) + 128 + steps // 2) // steps * steps
+    stepped = np.round(np.clip(columns.harmonics, -2, 2) * (128 / HARMONIC_STEP)) * HARMONIC_STEP + 128
     return (
         fixed.view(np.uint8).reshape(-1, 3, 4)[..., :3].reshape(-1, 9),  # three little-endian bytes for each coordinate
         arrays.to_bytes(255 * columns.opacities)[:, None],

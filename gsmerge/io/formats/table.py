@@ -114,7 +114,7 @@ class Format:
 
 _page = lazy_functions("gsmerge.drawing.pages")
 # Bytes of a Gaussian with harmonics up to degree 0, 1, 2 and 3
-_SPZ = 17.0, 18.5, 18.9, 19.2
+_SPZ = 17.0, 19.5, 22.8, 27.1
 _SOG = 13.0, 22.0, 36.5, 56.5
 _IN_TEXT = 4 / 3  # bytes of base64 per byte; a page has its .sog as base64
 PLY = Format(

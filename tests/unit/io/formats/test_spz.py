@@ -21,9 +21,10 @@ from gsmerge.io import kept_comments, read_gaussians, write_gaussians
 from gsmerge.io.formats.glb import glb_bytes
 from gsmerge.io.formats.read_gaussians import file_notes
 from gsmerge.io.formats.splat import splat_bytes
-from gsmerge.io.formats.spz import AXIS_SYSTEMS, gzip_bytes, spz_bytes
+from gsmerge.io.formats.spz import AXIS_SYSTEMS, HARMONIC_STEP, gzip_bytes, spz_bytes
 from gsmerge.io.formats.table import Contents
 from gsmerge.method.geometry.transforms import covariances, rotate_harmonics
+from gsmerge.results.outputs import name_outputs, write_outputs
 from gsmerge.settings.files import FileOptions
 
 # Two Gaussians of degree 1 as @adobe/spz 0.2.3 writes them, which is Niantic's library for browsers
@@ -63,6 +64,16 @@ def test_a_spz_of_niantic_is_read(tmp_path: Path) -> None:
         np.abs(actual.quats @ [[1, 0.5], [0, 0.5], [0, -0.5], [0, 0.5]]).diagonal(), 1, atol=2e-3
     )
     np.testing.assert_allclose(actual.shN[:, 1], [[0.25, 0, 0], [0, -0.5, 0.5]])
+
+
+@pytest.mark.parametrize("name", ["a.spz", "tileset.json"])
+def test_rounding_of_harmonics_is_fine_and_moves_no_mean(name: str, tmp_path: Path) -> None:
+    """Values between two steps go to the nearer one; halves that all went up would shift all colours."""
+    gaussians = some_gaussians(3, count=2000)
+    write_outputs(name_outputs(tmp_path / name, FileOptions(viewer_cameras=False)), Contents([gaussians]))
+    errors = read_gaussians(tmp_path / name).gaussians.shN - gaussians.shN
+    assert np.abs(errors).max() <= HARMONIC_STEP / 256 + 1e-6
+    assert abs(errors.mean()) < 1e-4
 
 
 @pytest.mark.parametrize("version", [1, 2])
