@@ -15,8 +15,9 @@ import cv2
 import numpy as np
 
 from gsmerge.method.compare.view_pictures import fit_size
-from gsmerge.method.geometry.transforms import camera_depths, project, sh0_to_rgb
+from gsmerge.method.geometry.transforms import camera_centres, camera_depths, project, sh0_to_rgb
 from gsmerge.method.kernels.pictures import convolve
+from gsmerge.method.kernels.raster.project import view_colors
 from gsmerge.method.raster import render
 from gsmerge.method.raster.photos import COVERED_TRANSMITTANCE, counting_pixels
 from gsmerge.prepare.compare_photos import COMPARED_OPACITY
@@ -41,9 +42,9 @@ LEAST_PART = 0.003  # least share of a picture that an edit covers; smaller part
 # Least distance of a moved Gaussian from its own pixel, in longer sides of a picture. Within it, Gaussians lie beside
 # their pixels because poses or lenses are inexact
 MOVED = 0.01
-# Largest share of Gaussians that were moved or have new colours, or of pixels without Gaussians. If more are, Gaussians
-# are stored in another order than their pixels, photos have another tone or look, or the exporter left out what it was
-# not sure of
+# Largest share of Gaussians that were moved or have new colours, of pixels without Gaussians, or of pixels that differ.
+# If more are, Gaussians are stored in another order than their pixels, photos have another tone or look, Gaussians are
+# rough all over, or the exporter left out what it was not sure of
 MOST_EDITED = 0.3
 COMPACT = 0.6  # least share of a view's pixels without Gaussians in one part; exporters leave out pixels everywhere
 SQUARE_3 = np.ones((3, 3), np.uint8)
@@ -67,6 +68,7 @@ def follow_edits(scene: Scene) -> tuple[Scene, str]:
     shares = _measure_shares(pictured, rows, edited)
     is_dense = _are_dense(shares)
     left = np.zeros(scene.images.shape[:3], bool)  # pixels whose own Gaussians are gone
+    unedited = scene
     if is_dense and scene.has_own_pixels:
         pixels, left = _move_homes(pictured)
         scene = replace(scene, pixels=pixels)
@@ -96,6 +98,8 @@ def follow_edits(scene: Scene) -> tuple[Scene, str]:
     images = np.stack([change(photo) for change, photo in zip(changes, pictured.images, strict=True)])
     large = None if scene.large_photos is None else change_large(scene.large_photos, changes)
     covered = sum(int(change.cover.sum()) for change in changes if change.cover is not None)
+    if covered > MOST_EDITED * masks.size:
+        return unedited, ""
     change = (
         f"the scene was edited after the photos were taken, at {100 * covered / masks.size:.1f} % of their pixels:"
         f" drawings of the scene replace the photos there{KEEP}"
@@ -108,11 +112,20 @@ def follow_edits(scene: Scene) -> tuple[Scene, str]:
 def _find_new_colors(scene: PicturedScene, rows: np.ndarray) -> np.ndarray:
     """Find which of the Gaussians ``rows [m]`` have a colour that no photo has at their place, as a mask ``[m]``."""
     width, height = fit_size((scene.cameras.width, scene.cameras.height), PHOTO_SIDE)
-    means = scene.gaussians.means[rows]
-    colors = sh0_to_rgb(scene.gaussians.sh0[rows, 0]).clip(0, 1).astype(np.float32)
+    gaussians = scene.gaussians[rows]
+    means = gaussians.means
+    base_colors = sh0_to_rgb(gaussians.sh0[:, 0]).clip(0, 1).astype(np.float32)
+    eyes = camera_centres(scene.cameras.viewmats)
 
     def compare(view: int) -> np.ndarray:
         """Return the distance ``[m]`` of each colour from those around its place in a photo; inf for unseen ones."""
+        colors = base_colors
+        if gaussians.sh_degree:  # harmonics may make up for base colours that are far off
+            ids = np.arange(len(rows), dtype=np.int32)
+            colors = np.empty_like(base_colors)
+            rays = (means - eyes[view]).astype(np.float32)
+            view_colors(rays, gaussians.sh0, gaussians.shN, ids, np.zeros(3, np.float32), 0, len(ids), colors)
+            colors = colors.clip(0, 1)
         photo = cv2.resize(scene.images[view], (width, height), interpolation=cv2.INTER_AREA)
         seen, places, _ = _look_up(means, scene, view, width, height)
         low = cv2.erode(photo, SQUARE_3).reshape(-1, 3)[places]

@@ -226,3 +226,22 @@ def test_gaussians_that_are_mostly_elsewhere_are_no_edit(with_ball: Scene) -> No
     """Such as those of a file with rows in another order."""
     shuffled = np.random.default_rng(0).permutation(len(with_ball.gaussians))
     assert_unchanged(replace(with_ball, gaussians=with_ball.gaussians[shuffled]))
+
+
+def test_base_colours_that_harmonics_make_up_for_are_no_edit(with_ball: Scene) -> None:
+    """Some trainers write base colours that are far off, and harmonics of degree 1 that bring them back."""
+    gaussians = with_ball.gaussians
+    off = of_ball(with_ball)[:, None] * np.float32([0.3, 0.3, 0.3])
+    to_wall = np.sqrt(3 / (4 * np.pi))  # of the harmonic along z, which all cameras look along
+    shN = np.zeros((len(gaussians), 3, 3), np.float32)
+    shN[:, 1] = off / np.float32(to_wall)
+    sh0 = gaussians.sh0 - rgb_to_sh0(off + 0.5)[:, None]
+    scene = replace(with_ball, gaussians=replace(gaussians, sh0=sh0.astype(np.float32), shN=shN), pixels=None)
+    assert_unchanged(scene)
+
+
+def test_gaussians_that_are_rough_all_over_are_no_edit(wall: Scene) -> None:
+    """A quarter of the Gaussians has a colour that no photo has, and drawings of them differ everywhere."""
+    rough = np.random.default_rng(0).random(len(wall.gaussians)) < 0.25
+    scene = replace(changed(wall, rough, sh0=np.full((1, 1, 3), -9, np.float32)), pixels=None)
+    assert_unchanged(scene)
