@@ -194,8 +194,24 @@ def _formats_page(page: str) -> str:
         for row in ROWS
     ]  # fmt: skip
     page = _renew(page, "formats", _table_lines(("name", "read", "written", "bytes", "what it is"), rows))
+    attributes = {"scales": "sizes", "sh0": "`f_dc`", "shN": "harmonics", "opacities": "opacities"}
+    held = [
+        (f"`{row.ending}`", *(_held_values(row, name) for name in attributes))
+        for row in ROWS
+        if row.max_degree >= 0 and not row.inside
+    ]
+    page = _renew(page, "values", _table_lines(("name", *attributes.values()), held))
     cameras = (f"- {row.files}: {' '.join(row.convention)}; {row.intrinsics}" for row in CAMERA_FORMATS)
     return _renew(page, "cameras", list(cameras))
+
+
+def _held_values(row: Any, name: str) -> str:
+    """Describe the values of an attribute that the format of a row holds."""
+    held = row.values.get(name)
+    if held is None:
+        return "none" if name == "shN" and row.max_degree == 0 else "no limits"
+    step = f"{100 * held.step:.2g} %" if name == "scales" else f"{held.step:.2g}"
+    return f"{held.low:.3g} to {held.high:.3g}" + (f", steps of {step}" if held.step else "")
 
 
 def _table_lines(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:

@@ -20,7 +20,6 @@ from gsmerge.errors import Doubt, DoubtWarning, SceneError, TargetError
 from gsmerge.io import atomic_outputs
 from gsmerge.io.formats.rows import result_comments
 from gsmerge.io.formats.table import Contents
-from gsmerge.io.formats.write import format_notes
 from gsmerge.method.facts.pictures import RENDERS
 from gsmerge.method.facts.prepared import Prepared
 from gsmerge.method.facts.scene_size import measure_size
@@ -38,6 +37,7 @@ from gsmerge.reading.input import as_scene, read_input
 from gsmerge.reading.read_scene import Loaded
 from gsmerge.reading.scene_files import SceneFiles, scene_title
 from gsmerge.results.candidate import Candidate, make_candidate
+from gsmerge.results.lost_values import format_notes
 from gsmerge.results.outputs import (
     Outputs,
     add_outputs,
@@ -152,13 +152,13 @@ def compact_files(
         contents = Contents(levels, comments, cameras, names, scene_title(files.ply))
         level_files = add_outputs(add, outputs, temporary, contents)
         _, *coarser_files = level_files  # the first level is the result itself
-        notes = [*format_notes(out, result.gaussians), *frame_notes(outputs, cameras), *doubt_changed(load.stats)]
+        notes = [*format_notes(out, result.gaussians, cameras), *frame_notes(outputs, cameras)]
         document = report_document(
             result.report, recognised=load.recognised, output_path=out,
             seconds_before={**(seconds_before or {}), "read": read_at - start},
             seconds_after={"write": perf_counter() - compacted_at},
             coarser=[(path, level.report) for path, level in zip(coarser_files, result.coarser, strict=True)],
-            notes=[*load.notes, *notes], written_at=level_files, cameras_path=cameras_path,
+            notes=[*load.notes, *notes, *doubt_changed(load.stats)], written_at=level_files, cameras_path=cameras_path,
         )  # fmt: skip
     format_.finish(out)
     return document

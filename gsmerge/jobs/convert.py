@@ -18,7 +18,6 @@ from gsmerge.io.formats.extra_columns import describe_extra_columns, join_extra_
 from gsmerge.io.formats.read_gaussians import FileInfo, kept_comments
 from gsmerge.io.formats.rows import RESULT_COMMENT, result_comments, states_vertical_axis, upward_axis
 from gsmerge.io.formats.table import Contents, Format
-from gsmerge.io.formats.write import format_notes
 from gsmerge.io.photo_files import read_images
 from gsmerge.method.geometry.frame import scene_frame
 from gsmerge.method.geometry.transforms import IDENTITY, Similarity, euler_to_rotmat, normalize
@@ -28,6 +27,7 @@ from gsmerge.method.stages.pair_merge import merge_neighbors
 from gsmerge.method.viewpoints.place_cameras import place_viewpoints
 from gsmerge.plan.counts import STREAMED_LEVELS, level_counts
 from gsmerge.reading.scene_files import find_scene_files, named_path, result_cameras, scene_title
+from gsmerge.results.lost_values import format_notes
 from gsmerge.results.outputs import NUM_FULL, Outputs, frame_notes, join_gaussians, pad_harmonics, write_outputs
 from gsmerge.runtime.documents import document_head, note_entries
 from gsmerge.runtime.memory import human_bytes
@@ -96,7 +96,7 @@ def convert_files(options: ConvertOptions) -> dict[str, Any]:
     if "unseen" in options.clean.drops:
         notes += _unseen_notes(options, dropped["unseen"], count, None if stored is None else stored.path)
     names = () if stored is None else stored.names
-    notes += format_notes(outputs.result, gaussians)
+    notes += format_notes(outputs.result, gaussians, moved_cameras)
     comments, comment_notes = _join_comments(infos, format_, moves=options.placement.moves)
     notes += comment_notes
     if any(RESULT_COMMENT in info.comments for info in infos):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from os import PathLike
 from pathlib import Path
@@ -11,7 +12,7 @@ from weakref import ReferenceType, ref
 import numpy as np
 
 from gsmerge.arrays import to_float32
-from gsmerge.errors import count_words
+from gsmerge.errors import DoubtWarning, count_words
 from gsmerge.frozen import dataclass, field, replace
 from gsmerge.io.formats.rows import result_comments
 from gsmerge.io.formats.table import Contents
@@ -22,6 +23,7 @@ from gsmerge.method.raster.metrics import SAMPLE_LOSS, describe_distance, descri
 from gsmerge.plan.make_plan import pictured_views
 from gsmerge.results.candidate import Candidate, rescore, with_moved_views
 from gsmerge.results.distance import describe_clear_loss, is_clearly_worse
+from gsmerge.results.lost_values import describe_lost_values
 from gsmerge.results.outputs import NUM_FULL, name_outputs, pad_harmonics, write_outputs
 from gsmerge.results.report import CompactReport, compared_psnr
 from gsmerge.results.scores import PartScores, measure_parts, score_input
@@ -94,6 +96,8 @@ class CompactResult:
         names = self.names or number_views(len(cameras))
         comments = result_comments(self.report.new_views)
         write_outputs(outputs, Contents(levels, comments, cameras, names, outputs.result.stem))
+        for text in describe_lost_values(outputs.result, levels[0], cameras):
+            warnings.warn(text, DoubtWarning, stacklevel=3)  # the caller: above this method and its decorator
         return outputs.result
 
     @check_arguments

@@ -61,9 +61,9 @@ SCENE_BITS = 14  # bits of a position within the scene: steps of a sixteenth of 
 LARGEST_POSITION = 2**23 - 1
 _SHIFTS = (20, 10, 0)  # lowest bits of the three smaller components of a rotation in its word
 # Step of harmonics, in 1/128. With steps of 2, the rounding of harmonics changes pictures as much as that of all other
-# columns together: they are 52.1 dB from those of the scene, with steps of 1 55.0, with 4 47.9, and with Niantic's steps
-# of 8 (degree 1) and 16 38.8. A file of as many bytes has a quarter fewer Gaussians than with Niantic's steps, and shows
-# new views of a glossy room .3 to .5 dB better, whatever its size
+# columns together: they are 52.1 dB from those of the scene, with steps of 1 55.0, with 4 47.9, and with Niantic's
+# steps of 8 (degree 1) and 16 38.8. A file of as many bytes has a quarter fewer Gaussians than with Niantic's steps,
+# and shows new views of a glossy room .3 to .5 dB better, whatever its size
 HARMONIC_STEP = 2
 COLOR_SCALE = 0.15  # factor of sh0, so that colours slightly outside [0, 1] can be stored
 # Names of the attributes of Gaussians, in the order of a .spz file

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Literal
@@ -20,7 +20,7 @@ from gsmerge.runtime.memory import human_bytes
 from gsmerge.runtime.plugins import lazy_functions
 from gsmerge.settings.files import FileOptions
 from gsmerge.settings.setting import join_words
-from gsmerge.types import NO_CAMERAS, Cameras, Gaussians, StrPath
+from gsmerge.types import NO_CAMERAS, SH_C0, Cameras, Gaussians, StrPath
 
 STATE_ENDING = ".gsm"  # ending of states, which gsmerge extend writes
 INDEX = "lod-meta.json"  # name of a Streamed SOG, by which viewers recognise it
@@ -49,6 +49,15 @@ PLAIN = Contents(())  # beside Gaussians, a file gets no comments and no cameras
 # and the content. The result is a dictionary: path of each level of detail, finest first -> temporary files of the
 # level.
 WriteOutput = Callable[[AddOutput, Path, Path, Contents], dict[Path, list[Path]]]
+
+
+@dataclass(frozen=True)
+class Held:
+    """The numbers of one attribute that a format holds: those from ``low`` to ``high``, others become the nearest."""
+
+    low: float
+    high: float
+    step: float  # between two numbers; of scales it is a factor less 1, and 0 stands for float32
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +91,12 @@ class Format:
     levels: Literal["", "apart", "inside"] = "apart"
     has_cameras: bool = False  # True: the cameras of views are inside the output, not in a file beside it
     round_means: Callable[[np.ndarray], np.ndarray] = to_float32  # rounds positions as a file of the format does
+    # Attribute of Gaussians, linear as in memory -> the numbers that the format holds; others have no limits
+    values: Mapping[str, Held] = field(default_factory=dict)
+    coarse: bool = (
+        False  # whether rounding to these numbers is visible, so that scores are measured on what is read back
+    )
+    inside: str = ""  # ending of the file inside an output, if it is a file of another format
     columns: bool = False  # whether the user can choose which of INRIA's columns a file has
     marks: Sequence[str] | None = ()  # comments of the input that a copy keeps; None: all of ``copied_comments``
     max_gaussians: float = math.inf  # most Gaussians that its public readers read
@@ -116,27 +131,35 @@ _page = lazy_functions("gsmerge.drawing.pages")
 # Bytes of a Gaussian with harmonics up to degree 0, 1, 2 and 3
 _SPZ = 17.0, 19.5, 22.8, 27.1
 _SOG = 13.0, 22.0, 36.5, 56.5
+_OPACITY = Held(0, 1, 1 / 255)
+_SPZ_VALUES = {
+    "scales": Held(math.exp(-10), math.exp(255 / 16 - 10), math.expm1(1 / 16)), "opacities": _OPACITY,
+    "sh0": Held(-0.5 / 0.15, 0.5 / 0.15, 1 / 255 / 0.15), "shN": Held(-1, 127 / 128, 1 / 64),
+}  # fmt: skip
 _IN_TEXT = 4 / 3  # bytes of base64 per byte; a page has its .sog as base64
 PLY = Format(
     ".ply", "everything as float32, in INRIA's columns", ply.read_rows, None, ply.MAX_DEGREE,
     gaussian_bytes=(68.0, 104.0, 164.0, 248.0), count=ply.count_for_bytes, columns=True, marks=None,
+    values={"scales": Held(math.exp(-30), math.exp(30), 0)},
     harmonics_note="harmonics above degree {degree} are left out, since few programs read a .ply with them",
 )  # fmt: skip
 LEVELS = Format(
     INDEX, "levels of detail in chunks; written by splat-transform",
     _lazy("streamed.read_rows"), None, 3, require=_lazy("splat_transform.find_program"),
     write=_lazy("streamed.write_output"), finish=_lazy("streamed.remove_unused_chunks"), levels="inside",
-    first_view=True, settings="settings.json", round_means=_lazy("sog.round_means"), marks=(MIP_COMMENT, FLAT_COMMENT),
+    first_view=True, settings="settings.json", inside=".sog", round_means=_lazy("sog.round_means"),
+    marks=(MIP_COMMENT, FLAT_COMMENT),
 )  # fmt: skip
 TILESET = Format(
     "tileset.json", "3D Tiles for Cesium: a .spz in a .glb beside it", _lazy("tileset.read_rows"), None, 3,
     holds=Path.is_file, write=_lazy("tileset.write_output"), levels="",
-    round_means=_lazy("spz.round_means"), marks=(MIP_COMMENT,), max_gaussians=10_000_000, beside="tileset.glb",
+    round_means=_lazy("spz.round_means"), values=_SPZ_VALUES, coarse=True, inside=".spz",
+    marks=(MIP_COMMENT,), max_gaussians=10_000_000, beside="tileset.glb",
     gaussian_bytes=_SPZ, other_bytes=_lazy("tileset.most_other_bytes"), measure=_lazy("tileset.most_bytes"),
 )  # fmt: skip
 HTML = Format(
     ".html", "a page with a viewer, which shows the .sog inside it", None, None, 3,
-    write=_page("site.write_output"), levels="", has_cameras=True, round_means=_lazy("sog.round_means"),
+    write=_page("site.write_output"), levels="", has_cameras=True, inside=".sog", round_means=_lazy("sog.round_means"),
     gaussian_bytes=tuple(_IN_TEXT * sog_bytes for sog_bytes in _SOG), other_bytes=_page("site.least_bytes"),
     measure=_page("site.measure"),
 )  # fmt: skip
@@ -148,7 +171,7 @@ FILES = (  # the first ending that matches counts, so .compressed.ply comes befo
     Format(
         ".spz", "Niantic's format; written as version 3 or 2", _lazy("spz.read_rows"), _lazy("spz.spz_bytes"), 3,
         max_gaussians=10_000_000, gaussian_bytes=_SPZ,
-        round_means=_lazy("spz.round_means"), marks=(MIP_COMMENT,),
+        round_means=_lazy("spz.round_means"), values=_SPZ_VALUES, coarse=True, marks=(MIP_COMMENT,),
     ),
     Format(
         ".sog", "WebP textures in a zip; rows in another order", _lazy("sog.read_rows"), _lazy("sog.sog_bytes"), 3,
@@ -157,7 +180,8 @@ FILES = (  # the first ending that matches counts, so .compressed.ply comes befo
     ),
     Format(
         ".splat", "antimatter15's format", _lazy("splat.read_rows"), _lazy("splat.splat_bytes"), 0,
-        gaussian_bytes=(32.0,),
+        gaussian_bytes=(32.0,), coarse=True,
+        values={"opacities": _OPACITY, "sh0": Held(-0.5 / SH_C0, 0.5 / SH_C0, 1 / 255 / SH_C0)},
     ),
     Format(
         ".glb", "binary glTF with KHR_gaussian_splatting", _lazy("glb.read_rows"), _lazy("glb.glb_bytes"), 3,

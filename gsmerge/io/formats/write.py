@@ -14,7 +14,7 @@ from gsmerge.arrays import distinct
 from gsmerge.io.atomic import AddOutput, atomic_output
 from gsmerge.io.formats import ply
 from gsmerge.io.formats.read_gaussians import read_gaussians
-from gsmerge.io.formats.table import OUTPUT_FORMATS, PLY, Contents, output_format
+from gsmerge.io.formats.table import FILES, OUTPUT_FORMATS, PLY, Contents, output_format
 from gsmerge.method.geometry.transforms import medians
 from gsmerge.runtime.arguments import check_arguments
 from gsmerge.types import Gaussians, StrPath
@@ -183,7 +183,7 @@ def check_readable(gaussians: Gaussians, comments: Sequence[str]) -> None:
         raise ValueError(f"comments: expected printable lines of ASCII, got {list(comments)}")
 
 
-def format_notes(path: StrPath, gaussians: Gaussians) -> list[str]:
+def output_notes(path: StrPath, gaussians: Gaussians) -> list[str]:
     """Note what a path's format leaves out, and how far its rounding moves Gaussians; raise UsageError without one."""
     return limit_notes(path, gaussians.sh_degree, len(gaussians)) + rounding_notes(path, gaussians)
 
@@ -218,14 +218,15 @@ def rounding_notes(path: StrPath, gaussians: Gaussians) -> list[str]:
 def round_as_written(path: StrPath, gaussians: Gaussians) -> Gaussians:
     """Return Gaussians as they are after writing and reading a file in the format of ``path``.
 
-    Gaussians are written to a temporary file and read from it. If the format cannot be read, only positions are
-    rounded. If the rounding of positions is invisible in renders, Gaussians are returned unchanged.
+    Gaussians are written to a temporary file and read from it, if the format is coarse or moves Gaussians visibly.
+    Otherwise only the harmonics that it cannot store are left out.
     """
-    if not rounding_notes(path, gaussians):
-        return gaussians
     format_ = output_format(path)
-    if format_.read is None:
-        return replace(gaussians, means=format_.round_means(gaussians.numpy().means.astype(np.float64)))
-    with TemporaryDirectory() as folder:
-        write_gaussians(Path(folder) / f"a{format_.ending}", gaussians)
-        return read_gaussians(Path(folder) / f"a{format_.ending}").gaussians
+    format_ = next((row for row in FILES if row.ending == format_.inside), format_)
+    if format_.coarse or rounding_notes(path, gaussians):
+        with TemporaryDirectory() as folder:
+            write_gaussians(Path(folder) / f"a{format_.ending}", gaussians)
+            return read_gaussians(Path(folder) / f"a{format_.ending}").gaussians
+    if gaussians.sh_degree > format_.max_degree:
+        return replace(gaussians, shN=gaussians.shN[:, : (format_.max_degree + 1) ** 2 - 1])
+    return gaussians

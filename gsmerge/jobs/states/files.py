@@ -14,7 +14,6 @@ from gsmerge.errors import SceneError, UsageError, count_words
 from gsmerge.io.atomic import common_mode
 from gsmerge.io.formats.rows import result_comments
 from gsmerge.io.formats.table import Contents
-from gsmerge.io.formats.write import format_notes
 from gsmerge.io.locks import lock_file
 from gsmerge.jobs.content_hash import content_hash, digest, list_files
 from gsmerge.jobs.states.compactor import extend_state
@@ -25,6 +24,7 @@ from gsmerge.reading.exporters import NO_HINTS, ReadHints
 from gsmerge.reading.file_stats import doubt_changed
 from gsmerge.reading.input import read_input
 from gsmerge.reading.scene_files import SceneFiles, scene_title
+from gsmerge.results.lost_values import format_notes
 from gsmerge.results.outputs import Outputs, write_outputs
 from gsmerge.runtime.documents import document_head, note_entries, seconds_document, seconds_line
 from gsmerge.runtime.memory import human_bytes, human_share, peak_memory
@@ -173,7 +173,7 @@ def decode_file(
     if len(gaussians) == 0:
         raise SceneError(path, "expected visible Gaussians, found none", "begin a new state with the scene")
     cameras = features.frame.leave_cameras(features.cameras)
-    notes = format_notes(out, gaussians)
+    notes = format_notes(out, gaussians, cameras)
     contents = Contents([gaussians], result_comments(None), cameras, features.names, scene_title(path))
     num_bytes = write_outputs(outputs, contents)
     seconds = {**(seconds_before or {}), "read": read_end - start, "decode": decode_end - read_end}
