@@ -280,7 +280,7 @@ def finish_joined(
         result = faintest_dropped(result, limit)
     if limit is not None and options.budget.is_filled and len(result) < limit:
         note(f"budget: {limit:,} Gaussians were asked for, {len(result):,} remain of those of all blocks")
-    if (size := file_size(options.budget)) and size.packed:
+    if (size := file_size(options.budget, 0)) and size.packed:
         content = size, cameras, names
         result = drop_to_bytes(result, *content, measure_least_bytes(result, *content))
     return result

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from gsmerge.counts.clean_up import build_candidate
 from gsmerge.errors import UsageError
@@ -11,7 +12,7 @@ from gsmerge.method.pipelines.plan import FileSize, Plan
 from gsmerge.method.stages.clean import faintest_dropped
 from gsmerge.results.candidate import Candidate, rescore
 from gsmerge.runtime.memory import human_bytes
-from gsmerge.runtime.record import add_seconds
+from gsmerge.runtime.record import add_seconds, note
 from gsmerge.types import Cameras, Gaussians
 
 BUILD_SURPLUS = 1.02  # Gaussians of a build, relative to the number that seems to fit
@@ -54,6 +55,24 @@ def meet_bytes(candidate: Candidate, prepared: Prepared, plan: Plan) -> Candidat
         built.append(candidate)
     gaussians = drop_to_bytes(candidate.gaussians, size, candidate.cameras, names, base_bytes)
     return candidate if len(gaussians) == len(candidate.gaussians) else rescore(candidate, gaussians, prepared, plan)
+
+
+def choose_harmonics(candidate: Candidate, prepared: Prepared, plan: Plan) -> Candidate:
+    """Build Gaussians without harmonics, of which more fit into the file; return the better one of both candidates."""
+    size = plan.count.file_size
+    assert size is not None, "a budget in bytes"
+    assert size.count_without_harmonics is not None, "a scene with harmonics"
+    gaussians = prepared.scene.gaussians
+    plain = replace(prepared, scene=replace(prepared.scene, gaussians=replace(gaussians, shN=gaussians.shN[:, :0])))
+    other = build_candidate(plain, plan, min(size.count_without_harmonics, plan.count.limits.most))
+    add_seconds(other.record.seconds)
+    if size.packed:
+        other = meet_bytes(other, plain, plan)
+    if other.psnr is None or candidate.psnr is None or other.psnr <= candidate.psnr:
+        return candidate
+    counts = f"{len(other.gaussians):,} Gaussians fit in place of {len(candidate.gaussians):,}"
+    note(f"harmonics are left out: {counts}, and have {other.psnr:.1f} dB in place of {candidate.psnr:.1f}")
+    return other
 
 
 def measure_least_bytes(gaussians: Gaussians, size: FileSize, cameras: Cameras, names: Sequence[str] = ()) -> int:

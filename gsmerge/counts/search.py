@@ -8,7 +8,7 @@ from typing import Any
 
 from gsmerge.counts.clean_up import build_candidate, clean_fitted, record_dropped
 from gsmerge.counts.curve import count_reaching, count_within, curve_counts, curve_knee, measure_curve
-from gsmerge.counts.file_size import meet_bytes
+from gsmerge.counts.file_size import choose_harmonics, meet_bytes
 from gsmerge.method.facts.pictures import PHOTOS, RENDERS
 from gsmerge.method.facts.prepared import LEAST_VIEWS, Prepared
 from gsmerge.method.kernels.elementary import exp, log, power
@@ -66,8 +66,11 @@ def search_count(prepared: Prepared, plan: Plan) -> Candidate:
     else:
         best = build_candidate(prepared, plan, choose_count(prepared, plan))
         add_seconds(best.record.seconds)
-    if plan.count.file_size is not None and plan.count.file_size.packed:
+    size = plan.count.file_size
+    if size is not None and size.packed:
         best = meet_bytes(best, prepared, plan)
+    if size is not None and size.count_without_harmonics is not None:
+        best = choose_harmonics(best, prepared, plan)
     adopt(best.record)
     return replace(best, record=current_record())
 

@@ -104,8 +104,8 @@ def level_counts(finest: int, num_levels: int, least: int = 1) -> list[int]:
     return [count for level in range(1, num_levels) if (count := finest // LEVEL_FACTOR**level) >= least]
 
 
-def file_size(options: BudgetOptions) -> FileSize | None:
-    """Return the file size that a budget in bytes requests; None for any other budget.
+def file_size(options: BudgetOptions, sh_degree: int) -> FileSize | None:
+    """Return the file size that a budget in bytes requests for a scene of a degree; None for any other budget.
 
     Raises UsageError if the size of the output does not follow from the number of its Gaussians.
     """
@@ -113,7 +113,13 @@ def file_size(options: BudgetOptions) -> FileSize | None:
     if file is None:
         return None
     num_bytes = parse_bytes(str(options.budget))
-    return FileSize(num_bytes, file.ending, packed=file.count is None, measure=partial(measure_bytes, file))
+    return FileSize(
+        num_bytes,
+        file.ending,
+        packed=file.count is None,
+        measure=partial(measure_bytes, file),
+        count_without_harmonics=count_for_bytes(file, num_bytes, 0) if sh_degree and file.max_degree else None,
+    )
 
 
 def _sized_format(options: BudgetOptions) -> Format | None:

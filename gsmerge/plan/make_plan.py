@@ -76,7 +76,7 @@ def make_plan(
             note(f"{few}; the result has at most half of them, and more may show the photos better: --budget NUMBER")
         return replace(
             plan,
-            count=replace(plan.count, file_size=file_size(options.budget)),
+            count=replace(plan.count, file_size=file_size(options.budget, size.sh_degree)),
             merge=plan_merge(prepared, plan, fit, checkpoint, merges_pairs=merges_pairs, cuts=cuts),
             fit=fit,
             score=plan_scores(prepared, plan, EFFORTS[options.effort].report_views),

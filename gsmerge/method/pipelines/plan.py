@@ -36,6 +36,8 @@ class FileSize:
     packed: bool  # The size depends on the content, so that the file has to be made to measure it
     # Returns the bytes of a file with Gaussians, cameras, and names of these, or an upper bound if it is a page
     measure: Callable[[Gaussians, Cameras, Sequence[str]], int]
+    # How many Gaussians fit without harmonics above degree 0; None if the scene has none
+    count_without_harmonics: int | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +138,8 @@ class Plan:
     def searches(self) -> bool:
         """Return whether several counts may be built: for a quality, for the file's size, or to clean up a result."""
         size = self.count.file_size
-        return self.count.has_quality or (size is not None and size.packed) or self.clean.asked
+        has_choice = size is not None and (size.packed or size.count_without_harmonics is not None)
+        return self.count.has_quality or has_choice or self.clean.asked
 
     def with_fixed_cameras(self) -> Plan:
         """Return the plan with a fit that does not move cameras."""
