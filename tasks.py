@@ -29,7 +29,7 @@ GENERATORS = ("docs/generate_reference.py", "docs/one_run.py", "docs/two_wings.p
 TASKS: dict[str, tuple[tuple[str, ...], ...]] = {  # the calls of each task
     "demo": (MAKE_VENV, (*INSTALL, "."), *MAIN_JOB),
     "main-job": MAIN_JOB,  # the demo with a package that is installed already
-    "setup": (MAKE_VENV, (*INSTALL, ".[test]")),
+    "setup": (MAKE_VENV, (*INSTALL, ".[test,site]")),
     "native": (("python", "gsmerge/method/kernels/build.py"),),
     "tests": (("python", "-m", "pytest"),),
     "sweeps": (("python", "-m", "pytest", "-m", "slow"),),
@@ -38,13 +38,14 @@ TASKS: dict[str, tuple[tuple[str, ...], ...]] = {  # the calls of each task
     "types": (("mypy", "-p", "gsmerge"),),
     "imports": (("lint-imports",),),
     "docs": tuple(("python", program, "--check") for program in GENERATORS),
+    "site": (("python", "docs/build_site.py"),),
     "reference": tuple(("python", program) for program in GENERATORS),
     "fuzz": (("python", "tools/fuzz.py"),),
     "sanitize": (("python", "tools/sanitize.py"),),
     "kills": (("python", "tools/kills.py"),),
     "pictures": (("python", "docs/pictures.py"),),
 }
-CHECKS = ("lint", "types", "imports", "docs", "tests", "sweeps")  # tasks that ``check`` stands for
+CHECKS = ("lint", "types", "imports", "docs", "site", "tests", "sweeps")  # tasks that ``check`` stands for
 
 
 def main(names: list[str]) -> int:

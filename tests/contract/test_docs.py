@@ -17,6 +17,7 @@ from typing import Any
 
 import pytest
 import typer.main
+from scripts import load_script
 
 import gsmerge
 from gsmerge.cli.app import app
@@ -34,7 +35,8 @@ LAB: dict[str, Any] = TOP["lab"].commands
 COMMANDS = {name: command for name, command in TOP.items() if name != "lab"} | {f"lab {n}": c for n, c in LAB.items()}
 
 
-PAGES = sorted(str(path.relative_to(ROOT)) for path in (*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")))
+PAGES = sorted(str(path.relative_to(ROOT)) for path in ROOT.glob("*.md"))
+PAGES += sorted(str(path.relative_to(ROOT)) for name in ("docs", "examples") for path in (ROOT / name).rglob("*.md"))
 MADE = ("docs/reference/commands", "docs/reference/settings")
 GENERATED = {page for page in PAGES if page.startswith(MADE)}
 WRITTEN = [page for page in PAGES if page not in GENERATED]
@@ -171,6 +173,31 @@ def test_links_on_a_page_lead_somewhere(page: str) -> None:
         if section:
             headings = re.findall(r"^#+ (.+)$", path.read_text(encoding="utf-8"), re.MULTILINE)
             assert section in {re.sub(r"[^\w -]", "", h.lower()).strip().replace(" ", "-") for h in headings}, target
+
+
+def test_every_page_and_what_it_links_to_is_on_the_site() -> None:
+    site = load_script(ROOT / "docs" / "build_site.py")
+    settings = site.SETTINGS.read_text(encoding="utf-8")
+    assert site.find_missing(settings) == []
+    assert set(PAGES) <= set(site.pages_of(settings))
+
+
+def test_the_site_refuses_what_would_be_missing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Pages without a place, and links to folders, to files that are not there and to pages without a place."""
+    site = load_script(ROOT / "docs" / "build_site.py")
+    (tmp_path / "docs").mkdir()
+    (tmp_path / "examples").mkdir()
+    (tmp_path / "examples" / "README.md").write_text("# Examples\n")
+    (tmp_path / "docs" / "lost.md").write_text("# Lost\n")
+    links = "[a](../README.md#a) [b](../examples) [c](none.md) [d](../examples/README.md) [e](https://example.org/x)"
+    (tmp_path / "docs" / "page.md").write_text(f"# Page\n\n{links}\n\n```\n[f](code.md)\n```\n")
+    (tmp_path / "README.md").write_text("[![badge](../../actions/badge.svg)](../../actions)\n")
+    monkeypatch.setattr(site, "ROOT", tmp_path)
+    monkeypatch.setattr(site, "SETTINGS", tmp_path / "docs" / "zensical.toml")
+    lines = site.find_missing('nav = ["README.md", "docs/page.md", "docs/gone.md"]')
+    places = [(line.partition(": ")[0], line.split()[-1]) for line in lines]
+    assert [place for place, _ in places] == ["docs/lost.md", *["docs/page.md"] * 3, "docs/zensical.toml"]
+    assert [word for _, word in places[1:3]] == ["docs/none.md", "examples"]
 
 
 def test_index_of_the_documentation_links_every_page() -> None:
