@@ -13,10 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import typer.main
-from api_page import api_page
 
 REFERENCE = Path(__file__).parent / "reference"
-COMMANDS, SETTINGS, API = "commands.md", "settings.md", "api.md"
+COMMANDS, SETTINGS = "commands.md", "settings.md"
 EXPORTERS, FORMATS = "exporters.md", "formats.md"  # pages whose prose is written by hand, and whose lists are made here
 NOTICE = "<!-- Made by docs/generate_reference.py from the program: change the help there and run it again. -->"
 COMMANDS_HEAD = """# Commands
@@ -51,7 +50,6 @@ def make_pages() -> dict[str, str]:
     return {
         COMMANDS: _commands_page(),
         SETTINGS: _settings_page(),
-        API: f"{NOTICE}\n\n{api_page()}",
         EXPORTERS: _exporters_page((REFERENCE / EXPORTERS).read_text(encoding="utf-8")),
         FORMATS: _formats_page((REFERENCE / FORMATS).read_text(encoding="utf-8")),
     }

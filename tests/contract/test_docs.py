@@ -172,7 +172,17 @@ def test_links_on_a_page_lead_somewhere(page: str) -> None:
         assert path.exists(), target
         if section:
             headings = re.findall(r"^#+ (.+)$", path.read_text(encoding="utf-8"), re.MULTILINE)
-            assert section in {re.sub(r"[^\w -]", "", h.lower()).strip().replace(" ", "-") for h in headings}, target
+            headings += re.findall(r"^::: (\S+)$", path.read_text(encoding="utf-8"), re.MULTILINE)
+            assert section in {
+                *headings,
+                *(re.sub(r"[^\w -]", "", h.lower()).strip().replace(" ", "-") for h in headings),
+            }, target
+
+
+def test_every_public_name_is_on_the_page_of_python() -> None:
+    """There the site has the docstrings."""
+    names = re.findall(r"^::: gsmerge\.(\w+)$", read("docs/reference/api.md"), re.MULTILINE)
+    assert sorted(names) == sorted({*gsmerge.__all__, "integrations"} - {"__version__"})
 
 
 def test_every_page_and_what_it_links_to_is_on_the_site() -> None:
