@@ -67,6 +67,15 @@ def test_wheels_are_built_and_tried_on_the_platforms_of_the_guide() -> None:
     assert re.findall(r"^\| `(\w+)\.whl`", guide, re.MULTILINE) == platforms
 
 
+def test_the_published_site_is_built_with_the_tools_of_the_setup() -> None:
+    """Without the package, which the docstrings are read from as text."""
+    text = (ROOT / ".github" / "workflows" / "site.yml").read_text(encoding="utf-8")
+    (extra,) = re.findall(r"^site = \[(.+)\]$", PROJECT, re.MULTILINE)
+    (installed,) = re.findall(r"pip install -c constraints\.txt (.+)$", text, re.MULTILINE)
+    assert installed.split() == re.findall(r'"([a-z-]+)>=', extra)
+    assert "run: python docs/build_site.py" in text
+
+
 @pytest.mark.parametrize(("tag", "code"), [(f"v{__version__}", 0), (__version__, 1), (f"v{__version__}.1", 1)])
 def test_a_tag_that_is_not_the_version_stops_the_wheels(tag: str, code: int) -> None:
     text = (ROOT / ".github" / "workflows" / "wheels.yml").read_text(encoding="utf-8")
