@@ -25,7 +25,7 @@ MAIN_JOB = (
     ("gsmerge", "render", "demo/scene.ply", "demo/scene.compact.ply", "-o", "demo/preview.png", "--overwrite"),
 )
 # What makes pages and pictures of the code
-GENERATORS = ("docs/generate_reference.py", "docs/one_run.py", "docs/two_wings.py")
+GENERATORS = ("docs/generate_reference.py", "docs/one_run.py", "docs/packages.py")
 TASKS: dict[str, tuple[tuple[str, ...], ...]] = {  # the calls of each task
     "demo": (MAKE_VENV, (*INSTALL, "."), *MAIN_JOB),
     "main-job": MAIN_JOB,  # the demo with a package that is installed already

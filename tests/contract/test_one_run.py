@@ -45,5 +45,5 @@ def test_a_sentence_that_is_no_longer_true_is_named(script: Any, run: Any) -> No
 
 
 def test_the_picture_of_the_packages_follows_the_import_contracts() -> None:
-    script = load_script(PROGRAM.with_name("two_wings.py"))
-    assert script.PICTURE.read_text("utf-8") == script.draw_picture(), "run python docs/two_wings.py to renew"
+    script = load_script(PROGRAM.with_name("packages.py"))
+    assert script.PICTURE.read_text("utf-8") == script.draw_picture(), "run python docs/packages.py to renew"

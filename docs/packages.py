@@ -1,7 +1,7 @@
-"""Draw the picture of the two wings of the package, docs/images/two-wings.svg, from the import contracts.
+"""Draw the picture of the two parts of the package, docs/images/packages.svg, from the import contracts.
 
-python docs/two_wings.py          # write the picture if it differs
-python docs/two_wings.py --check  # only name it; the exit code is 1 if it differs
+python docs/packages.py          # write the picture if it differs
+python docs/packages.py --check  # only name it; the exit code is 1 if it differs
 
 The order of the boxes is that of the contracts "Imports flow down" and "Imports of the method flow down" in
 pyproject.toml; what each is for stands in the tables of docs/internals/architecture.md.
@@ -20,7 +20,7 @@ import tomllib
 
 DOCS = Path(__file__).parent
 PAGE = DOCS / "internals" / "architecture.md"
-PICTURE = DOCS / "images" / "two-wings.svg"
+PICTURE = DOCS / "images" / "packages.svg"
 PROJECT = DOCS.parent / "pyproject.toml"
 # Sizes in pixels: a box, the gap below it, the distance of the columns, a line of text, and the margin
 WIDTH, GAP, APART, LINE, MARGIN = 440, 6, 60, 15, 20
@@ -38,7 +38,7 @@ def main() -> int:
     picture = draw_picture()
     if PICTURE.exists() and PICTURE.read_text("utf-8") == picture:
         return 0
-    print(f"{PICTURE.name} differs from the contracts: python docs/two_wings.py")
+    print(f"{PICTURE.name} differs from the contracts: python docs/packages.py")
     if "--check" in sys.argv:
         return 1
     PICTURE.write_text(picture, "utf-8", newline="\n")
@@ -59,7 +59,7 @@ def purposes() -> dict[str, str]:
 
 
 def draw_picture() -> str:
-    """Return the picture as SVG: a column for each wing, and below both what both use."""
+    """Return the picture as SVG: a column for each part, and below them what both use."""
     packages = layers("Imports flow down")
     at = packages.index("method")
     texts = purposes()
