@@ -36,7 +36,8 @@ def main() -> int:
         return 1
     for name in ("pages", "site", ".cache"):
         shutil.rmtree(BUILD / name, ignore_errors=True)
-    for file in sorted(set(pages_of(settings)).union(*map(links_of, pages_of(settings)))):
+    pages = pages_of(settings)
+    for file in sorted({*pages, "docs/site.css"}.union(*map(links_of, pages))):
         (BUILD / "pages" / file).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(ROOT / file, BUILD / "pages" / file)
         if file.endswith(".md"):

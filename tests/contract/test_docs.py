@@ -210,6 +210,12 @@ def test_the_site_refuses_what_would_be_missing(monkeypatch: pytest.MonkeyPatch,
     assert [word for _, word in places[1:3]] == ["docs/none.md", "examples"]
 
 
+@pytest.mark.parametrize("page", WRITTEN)
+def test_lists_in_lists_are_indented_by_four(page: str) -> None:
+    """The site reads fewer as a list of its own, which the repository's host does not show."""
+    assert re.findall(r"^ {1,3}[-*] .*$", read(page), re.MULTILINE) == []
+
+
 def test_index_of_the_documentation_links_every_page() -> None:
     index = read("docs/README.md")
     pages = [page.removeprefix("docs/") for page in PAGES if page.startswith("docs/")]
