@@ -148,6 +148,7 @@ function frame() {
 const say = (words) => { id("status").textContent = words; };
 
 async function start() {
+  say("3D loads …");
   listen();
   id("full").hidden = !document.fullscreenEnabled;
   try {

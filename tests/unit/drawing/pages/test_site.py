@@ -115,3 +115,8 @@ def test_page_with_a_scene_may_not_be_replaced_by_a_report(tmp_path: Path) -> No
     (tmp_path / "empty.html").touch()
     names = ("scene.html", "mine.html", "report.html", "empty.html", "none.html")
     assert [may_be_replaced(tmp_path / name) for name in names] == [False, False, True, True, True]
+
+
+def test_a_page_without_scripts_says_so_in_place_of_what_a_script_would_say(page: str) -> None:
+    (status,) = re.findall(r'<p id="status" role="status">(.*?)</p>', page)
+    assert re.fullmatch("<noscript>.*JavaScript.*</noscript>", status)
