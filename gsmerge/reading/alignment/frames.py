@@ -8,6 +8,7 @@ place, and the cameras are moved.
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import permutations, product
 
 import numpy as np
 
@@ -22,7 +23,7 @@ from gsmerge.method.geometry.transforms import (
     robust_weights,
 )
 from gsmerge.method.kernels.elementary import arccos
-from gsmerge.method.kernels.matrices import invert, matmul, solve_symmetric, transform
+from gsmerge.method.kernels.matrices import determinant, invert, matmul, solve_symmetric, transform
 from gsmerge.reading.alignment.resection import projection_errors, refine_poses, start_pose
 from gsmerge.reading.alignment.score import Correspondences
 from gsmerge.types import Cameras
@@ -65,17 +66,16 @@ def exporter_frames(cameras: Cameras, scale: float | None = None) -> list[Simila
     ]
 
 
-def quarter_turns() -> list[Similarity]:
-    """List the turns of the world by 90, 180 and 270 degrees about each axis, as from y up to z up."""
+def axis_turns() -> list[Similarity]:
+    """List the 23 turns of the world that put each axis onto an axis, as from y up to z up, or as nerfstudio's."""
     turns = list[Similarity]()
-    for axis, name in enumerate("xyz"):
-        first = (axis + 1) % 3
-        second = (axis + 2) % 3
-        for degrees, cosine, sine in ((90, 0, 1), (180, -1, 0), (270, 0, -1)):
-            rotation = np.eye(3)
-            rotation[[first, second, first, second], [first, second, second, first]] = cosine, cosine, -sine, sine
-            turns.append(Similarity(rotation, 1.0, np.zeros(3), f"turned by {degrees} degrees about the {name} axis"))
-    return turns
+    for axes in permutations(range(3)):
+        for signs in product((1.0, -1.0), repeat=3):
+            rotation = np.eye(3)[list(axes)] * np.array(signs)[:, None]
+            name = ", ".join(("" if sign > 0 else "-") + "xyz"[axis] for axis, sign in zip(axes, signs, strict=True))
+            if determinant(rotation) > 0:
+                turns.append(Similarity(rotation, 1.0, np.zeros(3), f"turned from axes x, y, z to {name}"))
+    return turns[1:]
 
 
 def fit_frame(cameras: Cameras, poses: np.ndarray, scale: float | None) -> Similarity:

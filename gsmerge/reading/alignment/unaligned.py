@@ -21,7 +21,7 @@ from gsmerge.method.geometry.transforms import (
 from gsmerge.method.kernels.elementary import exp
 from gsmerge.method.kernels.matrices import invert, matmul
 from gsmerge.reading.alignment.conventions import PosesInConvention, other_conventions
-from gsmerge.reading.alignment.frames import exporter_frames, quarter_turns
+from gsmerge.reading.alignment.frames import axis_turns, exporter_frames
 from gsmerge.reading.alignment.grids import Grid, with_poses
 from gsmerge.reading.alignment.registration.localise import find_frames, mirror
 from gsmerge.reading.alignment.score import AlignmentInput, photo_colors
@@ -34,6 +34,9 @@ RANDOM_SHARE = 0.85
 _COLOR_MARGIN = 1.3
 _MARGIN = 2.0
 _FRAME_GAIN = 1.1  # least score of another frame, divided by the score of the cameras as they are
+# Least score of a scale chosen by colours, divided by the score of a scale two steps away, and of a frame found by
+# keypoints, divided by that of a frame that exporters use
+_PEAK_GAIN = 1.05
 _SEEN_GAUSSIANS = 20_000  # number of Gaussians that are projected, to estimate the share that cameras see
 # Number of Gaussians whose colours are compared in other conventions and frames. It gives scores an error of 0.4 %,
 # which is small, as the scores of two frames have to differ by 5 % or more
@@ -304,15 +307,18 @@ def _choose_frame(inputs: AlignmentInput, usual: CameraCheck) -> Similarity | No
     if not len(inputs.images):
         return None
     frames = exporter_frames(inputs.cameras)
-    best, score = _best_frame(inputs, frames if usual.ok else [*frames, *quarter_turns()])
+    best, score = _best_frame(inputs, frames if usual.ok else [*frames, *axis_turns()])
     stands_out = _stands_out(inputs, best, score)
     # views without a photo are black and do not count; one photo is too few, because it fits somewhere in any scene
     has_photos = inputs.scale is None and inputs.images.any((1, 2, 3)).sum() > 1
     if has_photos and not (stands_out and _fits_exactly(inputs, best)):
         found = next((frame for frame in find_frames(inputs) if _fits_exactly(inputs, frame)), None)
-        if found is not None:
-            best, score = _best_frame(inputs, [best, found])
-            stands_out = best is found or stands_out
+        if found is not None:  # about right; a frame without its errors is chosen if that explains the photos as well
+            best, score = _best_frame(inputs, [best, *axis_turns()])
+            found_score = _score_frame(inputs, found)
+            if found_score > _PEAK_GAIN * score or not _stands_out(inputs, best, score):
+                best, score = found, found_score
+            stands_out = True
     if has_photos and not stands_out:
         # frames of `exporter_frames`: rotated into the first camera, turned to y up, and moved into the first camera
         solved = [_solve_scale(inputs, frame) for frame in (IDENTITY, frames[1], frames[4], frames[-1])]
@@ -371,8 +377,7 @@ def _stands_out(inputs: AlignmentInput, frame: Similarity, score: float) -> bool
     """Return True if the ``score`` of a frame is clearly higher than its scores at scales two steps of _SCALES away."""
     two_steps = float(_SCALES[2] / _SCALES[0])
     neighbour_scores = (_score_frame(inputs, _scale_frame(frame, factor)) for factor in (1 / two_steps, two_steps))
-    peak_gain = 1.05  # least score of a scale chosen by colours, divided by the score of a scale two steps away
-    return all(score > peak_gain * neighbour_score for neighbour_score in neighbour_scores)
+    return all(score > _PEAK_GAIN * neighbour_score for neighbour_score in neighbour_scores)
 
 
 def _scale_frame(frame: Similarity, factor: float) -> Similarity:

@@ -19,6 +19,7 @@ from gsmerge.errors import SceneError
 from gsmerge.method.geometry.transforms import Similarity
 from gsmerge.method.kernels import elementary
 from gsmerge.reading.alignment import unaligned
+from gsmerge.reading.alignment.frames import axis_turns
 from gsmerge.reading.read_scene import load_scene
 from gsmerge.types import SH_C0, Cameras
 
@@ -56,18 +57,31 @@ def test_cameras_are_rotated_into_the_first_for_padded_rows_of_volsplat(tmp_path
     assert np.allclose(viewmats[:, :3, 3], SMOOTH.w2c[:, :3, 3], atol=1e-6)
 
 
-@pytest.mark.parametrize(("axis", "degrees"), [(0, 90), (0, 270), (1, 90), (2, 180)])
-def test_cameras_are_turned_about_an_axis_for_voxels_with_another_axis_up(
-    tmp_path: Path, axis: int, degrees: int
-) -> None:
-    """As Blender has z up; the photos' colours decide."""
-    vector = np.zeros(3)
-    vector[axis] = np.radians(degrees)
-    turn = np.round(cv2.Rodrigues(vector)[0])
+@pytest.mark.parametrize("axes", ["x, -z, y", "x, z, -y", "-y, -x, -z", "z, x, y", "y, x, -z"])
+def test_cameras_are_turned_for_voxels_in_other_axes(tmp_path: Path, axes: str) -> None:
+    """As Blender has z up, and nerfstudio swaps the axes of COLMAP and Metashape; the photos' colours decide."""
+    turn = np.array([np.eye(3)["xyz".index(axis[-1])] * (-1 if "-" in axis else 1) for axis in axes.split(", ")])
     loaded = load_scene(save_export(tmp_path, SMOOTH, turned(voxel_rows(), turn)))
-    expected = f"the cameras are turned by {degrees} degrees about the {'xyz'[axis]} axis, as the photos' colours show"
-    assert expected in loaded.notes
+    assert f"the cameras are turned from axes x, y, z to {axes}, as the photos' colours show" in loaded.notes
     assert np.allclose(loaded.scene.cameras.viewmats[:, :3, :3], SMOOTH.w2c[:, :3, :3] @ turn.T, atol=1e-6)
+
+
+def test_a_frame_of_keypoints_gives_way_to_a_turn_that_shows_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where no frame fits exactly, keypoints are matched, and errors of their frame stay out of the cameras."""
+    turn = np.eye(3)[[2, 0, 1]]
+    near = Similarity(turn, 1.002, np.zeros(3), "by keypoints")
+    monkeypatch.setattr(unaligned, "find_frames", lambda inputs: iter([near]))
+    monkeypatch.setattr(unaligned, "_fits_exactly", lambda inputs, frame: frame is near)
+    loaded = load_scene(save_export(tmp_path, SMOOTH, turned(voxel_rows(), turn)))
+    assert any("to z, x, y" in note for note in loaded.notes)
+
+
+def test_axes_are_turned_in_all_ways() -> None:
+    rotations = np.array([np.eye(3), *(turn.rotation for turn in axis_turns())])
+    assert len(np.unique(rotations, axis=0)) == 24
+    assert np.allclose(np.linalg.det(rotations), 1)
 
 
 @sweep("scale", [0.2, 1.0, 3.0])
