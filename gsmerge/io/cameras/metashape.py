@@ -16,33 +16,76 @@ from gsmerge.io.bounds import read_budget, read_text
 from gsmerge.io.cameras.camera_file import check_camera_count
 from gsmerge.io.cameras.camera_source import CameraSource, number_errors
 from gsmerge.io.cameras.view_layout import Entry
+from gsmerge.method.kernels.matrices import matmul
 
-_ATTRIBUTES = {"id", "type", "class", "width", "height", "sensor_id", "component_id", "label"}
+_ATTRIBUTES = {"id", "type", "class", "width", "height", "sensor_id", "component_id", "master_id", "label"}
 
 
 def list_metashape_cameras(source: CameraSource) -> list[Entry]:
-    """List the cameras of the component with the most cameras, each with the values of its sensor."""
+    """List the cameras of the component with the most cameras, each with the values of its sensor.
+
+    Of the cameras of a rig only the master has a pose. The others stand where their sensors do in the master's axes.
+    """
     path = source.path
-    root = _read_xml(path, _ATTRIBUTES)
-    cameras = [camera for camera in root.iter("camera") if camera.find("transform") is not None]
-    check_camera_count(path, len(cameras))
-    largest = dict(Counter(camera.get("component_id") for camera in cameras).most_common(1))
-    sensors = {sensor.get("id"): sensor for sensor in root.iter("sensor")}
+    chunk, placed = _read_component(path)
+    sensors = {sensor.get("id"): sensor for sensor in chunk.iter("sensor")}
     values: dict[str | None, dict[str, Any]] = {}  # id of a sensor -> its values
     entries = []
-    for camera in (camera for camera in cameras if camera.get("component_id") in largest):
+    for camera, master in placed:
         name = camera.get("label") or ""
         sensor_id = camera.get("sensor_id")
         if sensor_id not in sensors:
             raise SceneError(path, f"view {name}: expected the id of one of the sensors, found {sensor_id!r}")
+        sensor = sensors[sensor_id]
+        offset = None if camera is master else _read_motion(path, f"sensor {sensor_id}", sensor, "location")
+        if camera is not master and offset is None:
+            continue  # its place in the rig is not known
         if sensor_id not in values:
             expected = "expected a 'calibration' with a 'resolution' and the number 'f'"
             with number_errors(path, f"sensor {sensor_id}: {expected}"):
-                values[sensor_id] = _sensor_values(sensors[sensor_id])
+                values[sensor_id] = _sensor_values(sensor)
         with number_errors(path, f"view {name}: expected 16 numbers in 'transform'"):
-            pose = np.array(camera.findtext("transform", "").split(), np.float64).reshape(4, 4)
+            pose = np.array(master.findtext("transform", "").split(), np.float64).reshape(4, 4)
+        pose = pose if offset is None else matmul(pose, offset)
         entries.append(Entry({"transform": pose}, values[sensor_id], name))
     return entries
+
+
+def _read_component(path: Path) -> tuple[Element, list[tuple[Element, Element]]]:
+    """Read the chunk with the most placed cameras, and those of its component with the most, each with its master.
+
+    The master of a camera that has a pose is the camera itself.
+    """
+    root = _read_xml(path, _ATTRIBUTES)
+    found: tuple[Element, list[tuple[Element, Element]]] = root, []
+    for chunk in root.findall("chunk") or [root]:
+        masters = {camera.get("id"): camera for camera in chunk.iter("camera")}
+        pairs = list[tuple[Element, Element]]()
+        for camera in chunk.iter("camera"):
+            has_pose = camera.find("transform") is not None
+            master = camera if has_pose else masters.get(camera.get("master_id"))
+            if master is not None and master.find("transform") is not None:
+                pairs.append((camera, master))
+        if len(pairs) > len(found[1]):
+            found = chunk, pairs
+    chunk, pairs = found
+    check_camera_count(path, len(pairs))
+    largest = dict(Counter(master.get("component_id") for _, master in pairs).most_common(1))
+    return chunk, [pair for pair in pairs if pair[1].get("component_id") in largest]
+
+
+def _read_motion(path: Path, name: str, element: Element, shift: str) -> np.ndarray | None:
+    """Read a motion ``[4,4]`` of a ``rotation`` row by row and a ``shift``; None if there is neither."""
+    rotation, place = element.findtext("rotation"), element.findtext(shift)
+    if rotation is None and place is None:
+        return None
+    motion = np.eye(4)
+    with number_errors(path, f"{name}: expected 9 numbers in 'rotation' and 3 in {shift!r}"):
+        if rotation is not None:
+            motion[:3, :3] = np.array(rotation.split(), np.float64).reshape(3, 3)
+        if place is not None:
+            motion[:3, 3] = np.array(place.split(), np.float64).reshape(3)
+    return motion
 
 
 def _sensor_values(sensor: Element) -> dict[str, Any]:
