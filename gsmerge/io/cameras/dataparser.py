@@ -1,4 +1,4 @@
-"""Read how programs moved cameras into the Gaussians' world: by the map of nerfstudio, or by the offset of a survey."""
+"""Read how programs moved cameras into the Gaussians' world: by the map of nerfstudio or Metashape, or by an offset."""
 
 from __future__ import annotations
 
@@ -15,7 +15,9 @@ from gsmerge.io.cameras.camera_file import MAX_NUMBER, make_similarity
 from gsmerge.io.cameras.camera_source import number_errors, to_array, to_number
 from gsmerge.method.geometry.transforms import Similarity
 from gsmerge.method.kernels.matrices import invert, matmul
+from gsmerge.runtime.plugins import lazy_functions
 
+_list_metashape_frames = lazy_functions(__package__)("metashape.list_metashape_frames")
 DATAPARSER = "dataparser_transforms.json"  # name of nerfstudio's file with its map
 # Pattern of an offset: three numbers that stand alone in a line, an element or brackets
 _OFFSET = re.compile(r"(?:^|[>:=(])\s*N[\s,;]+N[\s,;]+N\s*(?:$|[<)])".replace("N", r"([-+]?\d+\.?\d*)"), re.MULTILINE)
@@ -28,17 +30,19 @@ def read_dataparser(ply: Path, cameras: Path | None) -> list[Similarity]:
     Gaussians: X' = scale (transform [X; 1]). If a ``transforms.json`` has an ``applied_transform`` (and
     ``applied_scale``), its poses are already moved by ``applied_transform``. A second similarity is therefore returned,
     which undoes ``applied_transform`` before it applies the map. If nerfstudio's file is missing, offsets of surveys
-    are read. Raise SceneError if nerfstudio's map is not a rotation, a shift and a positive scale.
+    are read. A file of Metashape has maps of its own. Raise SceneError if a map is not a rotation, a shift and a
+    positive scale.
     """
     folders = [ply.parent] + ([] if cameras is None else [cameras.parent])
     path = next((folder / DATAPARSER for folder in folders if (folder / DATAPARSER).is_file()), None)
+    own = _list_metashape_frames(cameras) if cameras is not None and cameras.suffix.lower() == ".xml" else []
     if path is None:
-        return _read_offsets(folders)
+        return [*own, *_read_offsets(folders, cameras)]
     data = read_json(path)
     with number_errors(path, "expected 'transform' of 3x4 numbers and 'scale'"):
         transform = _to_square(data["transform"])
         scale = to_number(data["scale"])
-    candidates = [make_similarity(path, transform, scale)]
+    candidates = [*own, make_similarity(path, transform, scale)]
     camera_data = read_json(cameras) if cameras is not None and cameras.suffix == ".json" and cameras.is_file() else {}
     if isinstance(camera_data, dict) and "applied_transform" in camera_data:
         with number_errors(cameras or path, "expected 'applied_transform' of 3x4 numbers"):
@@ -48,7 +52,7 @@ def read_dataparser(ply: Path, cameras: Path | None) -> list[Similarity]:
     return candidates
 
 
-def _read_offsets(folders: Sequence[Path]) -> list[Similarity]:
+def _read_offsets(folders: Sequence[Path], cameras: Path | None) -> list[Similarity]:
     """Read the offsets in metres that surveys subtract from coordinates; return moves of the cameras by each offset.
 
     An offset is three numbers that stand alone in a line or element of a small file. Metashape and CloudCompare write
@@ -58,7 +62,8 @@ def _read_offsets(folders: Sequence[Path]) -> list[Similarity]:
     # of files that may have an offset, and how many of these are read
     endings = (".txt", ".xml", ".xyz")
     max_files = 8
-    paths = sorted({path for folder in folders for path in folder.glob("[!.]*") if path.suffix in endings})
+    found = {path for folder in folders for path in folder.glob("[!.]*") if path.suffix in endings and path != cameras}
+    paths = sorted(found)
     small = [path for path in paths if path.is_file() and os.access(path, os.R_OK) and path.stat().st_size <= 1 << 12]
     matches = [(path.name, _OFFSET.search(path.read_text("latin-1"))) for path in small[:max_files]]
     offsets = {tuple(map(float, numbers.groups())): name for name, numbers in matches if numbers is not None}

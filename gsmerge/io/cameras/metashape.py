@@ -12,10 +12,12 @@ from xml.parsers import expat
 import numpy as np
 
 from gsmerge.errors import SceneError
+from gsmerge.frozen import replace
 from gsmerge.io.bounds import read_budget, read_text
-from gsmerge.io.cameras.camera_file import check_camera_count
+from gsmerge.io.cameras.camera_file import check_camera_count, make_similarity
 from gsmerge.io.cameras.camera_source import CameraSource, number_errors
 from gsmerge.io.cameras.view_layout import Entry
+from gsmerge.method.geometry.transforms import Similarity
 from gsmerge.method.kernels.matrices import matmul
 
 _ATTRIBUTES = {"id", "type", "class", "width", "height", "sensor_id", "component_id", "master_id", "label"}
@@ -49,6 +51,28 @@ def list_metashape_cameras(source: CameraSource) -> list[Entry]:
         pose = pose if offset is None else matmul(pose, offset)
         entries.append(Entry({"transform": pose}, values[sensor_id], name))
     return entries
+
+
+def list_metashape_frames(path: Path) -> list[Similarity]:
+    """List the maps from the axes of a chunk's cameras to the world, of the chunk and of the component.
+
+    nerfstudio applies the component's map without its scale, so each is listed without it, too.
+    """
+    chunk, placed = _read_component(path)
+    component_id = placed[0][1].get("component_id") if placed else None
+    components = [one for one in chunk.iter("component") if one.get("id") == component_id][:1]
+    frames = list[Similarity]()
+    for element in (chunk, *components):
+        transform = element.find("transform")
+        motion = None if transform is None else _read_motion(path, element.tag, transform, "translation")
+        if transform is not None and motion is not None:
+            with number_errors(path, f"{element.tag}: expected the number 'scale'"), np.errstate(all="ignore"):
+                scale = float(transform.findtext("scale", "1"))
+                motion[:3, 3] /= scale
+            name = f"moved by the transform of the {element.tag} in {path.name}"
+            for factor, words in ((scale, name), (1.0, f"{name} without its scale")):
+                frames.append(replace(make_similarity(path, motion, factor), description=words))
+    return frames
 
 
 def _read_component(path: Path) -> tuple[Element, list[tuple[Element, Element]]]:

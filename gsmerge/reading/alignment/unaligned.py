@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from itertools import product
+from itertools import chain, product
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from gsmerge.reading.alignment.conventions import PosesInConvention, other_conve
 from gsmerge.reading.alignment.frames import axis_turns, exporter_frames
 from gsmerge.reading.alignment.grids import Grid, with_poses
 from gsmerge.reading.alignment.registration.localise import find_frames, mirror
+from gsmerge.reading.alignment.registration.register import compose
 from gsmerge.reading.alignment.score import AlignmentInput, photo_colors
 from gsmerge.types import Cameras, Gaussians
 
@@ -249,7 +250,7 @@ def choose_cameras(
         if best > 0:
             return replace(grid, frame=tried[best]), checks[best], []
     poses, check, note = choose_poses(*rows, inputs.cameras, inputs.images, grid.camera_file.convention)
-    frame = _choose_frame(inputs, check)
+    frame = _choose_frame(inputs, check, frames)
     if frame is not None:
         _check_colors(inputs, frame.move_cameras(inputs.cameras), frame.description, no_pixels)
         return replace(grid, frame=frame, shown_by="photos' colours"), None, []
@@ -296,18 +297,24 @@ def _check_colors(inputs: AlignmentInput, cameras: Cameras, name: str, no_pixels
         raise SceneError(no_pixels.path, f"{no_pixels.problem}; {measured}", remedy)
 
 
-def _choose_frame(inputs: AlignmentInput, usual: CameraCheck) -> Similarity | None:
+def _choose_frame(inputs: AlignmentInput, usual: CameraCheck, stated: Sequence[Similarity]) -> Similarity | None:
     """Choose a frame in which the colours fit the photos clearly better than in the frame of the cameras.
 
     Returns None if no frame fits clearly better. The frames of exporters are tried and, if the cameras as they are do
-    not fit, the world turned about its axes. ``usual`` is the check of the cameras as they are. Colours fit best at the
-    true scale, so the chosen frame must fit better than the same frame at nearby scales. If no frame stands out at the
-    scale of the cameras, the scale is solved for.
+    not fit, the world turned about its axes, also before and after the frames ``stated`` in a file. ``usual`` is the
+    check of the cameras as they are. Colours fit best at the true scale, so the chosen frame must fit better than the
+    same frame at nearby scales. If no frame stands out at the scale of the cameras, the scale is solved for.
     """
     if not len(inputs.images):
         return None
     frames = exporter_frames(inputs.cameras)
-    best, score = _best_frame(inputs, frames if usual.ok else [*frames, *axis_turns()])
+    turned = list[Similarity]()
+    if not usual.ok:
+        turned = axis_turns()
+        for first, second in chain(product(stated, axis_turns()), product(axis_turns(), stated)):
+            words = f"{first.description} and {second.description}"
+            turned.append(replace(compose(second, first), description=words))
+    best, score = _best_frame(inputs, [*frames, *turned])
     stands_out = _stands_out(inputs, best, score)
     # views without a photo are black and do not count; one photo is too few, because it fits somewhere in any scene
     has_photos = inputs.scale is None and inputs.images.any((1, 2, 3)).sum() > 1

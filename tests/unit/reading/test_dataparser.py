@@ -7,12 +7,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 from exports import smooth_scene
 from messages import refuses
 from sweeps import sweep
 from tiny_scene import FLIP, Tiny, frames_of, rotation, write_colmap_text, write_transforms
 
 from gsmerge.errors import SceneError
+from gsmerge.io.cameras.dataparser import DATAPARSER
 from gsmerge.reading.held_out import read_into_frame
 from gsmerge.reading.read_scene import load_scene
 
@@ -39,6 +41,10 @@ def write_dataparser(folder: Path, **changes: object) -> None:
     (folder / "dataparser_transforms.json").write_text(json.dumps({"transform": matrix, "scale": SCALE} | changes))
 
 
+def words(numbers: np.ndarray) -> str:
+    return " ".join(map(repr, numbers.reshape(-1).tolist()))
+
+
 def assert_moved(folder: Path) -> None:
     loaded = load_scene(folder)
     assert NOTE in loaded.notes
@@ -52,6 +58,26 @@ def test_cameras_of_the_capture_are_moved_into_the_frame_of_gaussians(tmp_path: 
     save_trained(tmp_path)
     write_colmap_text(tmp_path / "sparse", SMOOTH)
     assert_moved(tmp_path)
+
+
+@pytest.mark.parametrize("cycled", [False, True], ids=["as it is", "in nerfstudio's axes"])
+def test_cameras_of_metashape_are_moved_by_the_transform_of_its_chunk(tmp_path: Path, cycled: bool) -> None:
+    """The photos decide, as the chunk's own axes may be the Gaussians'."""
+    save_trained(tmp_path)
+    (tmp_path / DATAPARSER).unlink()
+    world = np.eye(3)[[2, 0, 1]] if cycled else np.eye(3)
+    motion = world.T @ TURN
+    move = f"<rotation>{words(motion)}</rotation><translation>{words(SCALE * world.T @ SHIFT)}</translation>"
+    text = f"<document><chunk><transform>{move}<scale>{SCALE}</scale></transform>"
+    text += f'<sensor id="0"><resolution width="{SMOOTH.width}" height="{SMOOTH.height}"/>'
+    text += f"<calibration><f>{SMOOTH.K[0, 0]}</f></calibration></sensor>"
+    for name, pose in zip(SMOOTH.names, SMOOTH.c2w, strict=True):
+        text += f'<camera sensor_id="0" label="{name}"><transform>{words(pose)}</transform></camera>'
+    (tmp_path / "cameras.xml").write_text(f"{text}</chunk></document>")
+    loaded = load_scene(tmp_path)
+    axes = " and turned from axes x, y, z to z, x, y, as the photos' colours show" if cycled else ""
+    assert f"the cameras are moved by the transform of the chunk in cameras.xml{axes}" in loaded.notes
+    assert np.allclose(loaded.scene.cameras.centres, SCALE * (SMOOTH.c2w[:, :3, 3] @ TURN.T + SHIFT))
 
 
 def test_cameras_of_a_path_are_moved_as_those_of_the_capture(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Cameras of Metashape: the slaves of a rig, and the largest of several chunks."""
+"""Cameras of Metashape: the slaves of a rig, the largest of several chunks, and the maps to the world."""
 
 from __future__ import annotations
 
@@ -6,9 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from messages import refuses
 from program_cameras import C2W, FORMATS
 from tiny_scene import rotation
 
+from gsmerge.errors import SceneError
+from gsmerge.io.cameras.metashape import list_metashape_frames
 from gsmerge.io.cameras.read_cameras import read_cameras
 from gsmerge.method.kernels.matrices import invert
 
@@ -64,3 +67,36 @@ def test_the_chunk_with_the_most_cameras_is_read(tmp_path: Path) -> None:
     path = save(tmp_path, ("<chunk>", f"{other}</chunk><chunk>"))
     assert read_cameras(path).names == ("0.png", "1.png", "2.png")
     assert (read_cameras(path).Ks[:, 1, 1] == 42).all()
+
+
+def test_the_maps_of_chunk_and_component_are_listed(tmp_path: Path) -> None:
+    """nerfstudio applies that of the component without its scale."""
+    move = f"<rotation>{words(TURN)}</rotation><translation>2 4 6</translation><scale locked='0'>2</scale>"
+    region = "<region><center>9 9 9</center><R>1 0 0 0 1 0 0 0 1</R></region>"
+    components = f'<components><component id="0">{region}<transform><scale>3</scale></transform></component>'
+    components += f'<component id="1">{region}<transform>{move}</transform></component></components>'
+    path = save(tmp_path, ("<chunk>", f"<chunk>{region}<transform><rotation>{words(TURN)}</rotation></transform>"))
+    path.write_text(
+        path.read_text().replace("<cameras>", f"{components}<cameras>").replace(" label=", ' component_id="1" label=')
+    )
+    chunk, _, component, unscaled = list_metashape_frames(path)
+    assert (chunk.scale, component.scale, unscaled.scale) == (1, 2, 1)
+    assert all(np.allclose(frame.rotation, TURN) for frame in (chunk, component, unscaled))
+    assert component.shift.tolist() == [2, 4, 6]
+    assert unscaled.shift.tolist() == [1, 2, 3]
+    assert "component in cameras.xml" in component.description
+
+
+@pytest.mark.parametrize(
+    ("move", "found"),
+    [
+        ("<rotation>1 2</rotation>", "chunk"),
+        ("<translation>1 2 x</translation>", "chunk"),
+        ("<translation>1 2 3</translation><scale>0</scale>", "another map"),
+        ("<rotation>1 0 0 0 1 0 0 0 9</rotation>", "another map"),
+    ],
+)
+def test_a_damaged_map_is_refused(tmp_path: Path, move: str, found: str) -> None:
+    path = save(tmp_path, ("<chunk>", f"<chunk><transform>{move}</transform>"))
+    with refuses(SceneError, "cameras.xml", found):
+        list_metashape_frames(path)

@@ -176,7 +176,7 @@ def test_a_frame_is_refused_where_photos_contradict_the_foremost_colours(
     rows = voxel_rows()
     rows["x"] += np.random.default_rng(0).uniform(-0.05, 0.05, len(rows))  # a pixel to each side
     folder = save_export(tmp_path, SMOOTH, rows)
-    monkeypatch.setattr(unaligned, "_choose_frame", lambda inputs, usual: wrong)
+    monkeypatch.setattr(unaligned, "_choose_frame", lambda inputs, usual, stated: wrong)
     with refuses(SceneError, "scene.ply", "somewhere else", "colours", "--hint exporter"):
         load_scene(folder, cameras=folder)
 
