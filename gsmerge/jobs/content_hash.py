@@ -12,14 +12,14 @@ from typing import Any
 from gsmerge.errors import SceneError, UsageError, attempt
 from gsmerge.io import SCENE_SUFFIXES, read_cameras
 from gsmerge.io.bounds import read_errors
-from gsmerge.io.cameras.dataparser import DATAPARSER
+from gsmerge.io.cameras.dataparser import list_dataparsers
 from gsmerge.io.cameras.foreign import INTRINSICS
 from gsmerge.io.cameras.programs import FRAMES_FILE
 from gsmerge.reading.file_stats import list_inner
 from gsmerge.reading.photos.scene_photos import find_photos
 from gsmerge.reading.scene_files import SceneFiles
 
-EXTRA_FILES = (DATAPARSER, INTRINSICS, FRAMES_FILE)  # read with some camera files
+EXTRA_FILES = (INTRINSICS, FRAMES_FILE)  # read with some camera files
 
 
 def digest(value: Mapping[str, Any]) -> str:
@@ -48,7 +48,7 @@ def list_files(files: SceneFiles) -> list[Path]:
         root = cameras if cameras.is_dir() else cameras.parent
         folders = (root, cameras.parent, files.ply.parent)
         paths += [folder / name for folder in folders for name in EXTRA_FILES if (folder / name).exists()]
-        paths += list_photos(files, cameras)
+        paths += [*list_dataparsers(files.ply, root / "_"), *list_photos(files, cameras)]
     return list(dict.fromkeys(paths))
 
 

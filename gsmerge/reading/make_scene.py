@@ -57,7 +57,7 @@ def place_views(
         cameras = to_cameras(pinholes, photo_size(limited))
         result = AlignmentResult(None, cameras, as_floats(limited), pinholes, problem=problem)
     else:
-        frames = partial(read_dataparser, files.ply, files.cameras)
+        frames = partial(read_dataparser, files.ply, Path(camera_file.path))
         result = find_pixels(ply, pinholes, limited, order=order, scale=hints.scene_scale, frames=frames)
     photos = photos.without_files(photos.damaged)  # now that all photos were decoded
     notes += [*size_notes, *result.notes]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Sequence
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +20,27 @@ from gsmerge.runtime.plugins import lazy_functions
 
 _list_metashape_frames = lazy_functions(__package__)("metashape.list_metashape_frames")
 DATAPARSER = "dataparser_transforms.json"  # name of nerfstudio's file with its map
+_LEVELS = 4  # of folders above a scene and its cameras, in which nerfstudio's file or its outputs may be
+_MOST_OUTPUTS = 16  # of nerfstudio that are tried
 # Pattern of an offset: three numbers that stand alone in a line, an element or brackets
 _OFFSET = re.compile(r"(?:^|[>:=(])\s*N[\s,;]+N[\s,;]+N\s*(?:$|[<)])".replace("N", r"([-+]?\d+\.?\d*)"), re.MULTILINE)
 
 
-def read_dataparser(ply: Path, cameras: Path | None) -> list[Similarity]:
+def list_dataparsers(ply: Path, cameras: Path) -> list[Path]:
+    """List nerfstudio's files with its map: the one beside the scene, its cameras or above these, or of all outputs.
+
+    nerfstudio keeps exports, captures and outputs apart, so that the folder ``outputs`` is beside those of the others.
+    """
+    above = [folder for path in (cameras, ply) for folder in Path(os.path.abspath(path)).parents[:_LEVELS]]
+    above = [*dict.fromkeys((ply.parent, *above))]
+    beside = next((folder / DATAPARSER for folder in above if (folder / DATAPARSER).is_file()), None)
+    if beside is not None:
+        return [beside]
+    outputs = (path for folder in above for path in sorted(folder.glob(f"outputs/*/*/*/{DATAPARSER}")))
+    return list(islice(outputs, _MOST_OUTPUTS))
+
+
+def read_dataparser(ply: Path, cameras: Path) -> list[Similarity]:
     """Return the similarities by which nerfstudio or a survey may have moved the cameras. The caller tries each one.
 
     Nerfstudio's ``dataparser_transforms.json`` has the map from the world of the capture into the world of the
@@ -33,26 +50,26 @@ def read_dataparser(ply: Path, cameras: Path | None) -> list[Similarity]:
     are read. A file of Metashape has maps of its own. Raise SceneError if a map is not a rotation, a shift and a
     positive scale.
     """
-    folders = [ply.parent] + ([] if cameras is None else [cameras.parent])
-    path = next((folder / DATAPARSER for folder in folders if (folder / DATAPARSER).is_file()), None)
-    own = _list_metashape_frames(cameras) if cameras is not None and cameras.suffix.lower() == ".xml" else []
-    if path is None:
-        return [*own, *_read_offsets(folders, cameras)]
-    data = read_json(path)
-    with number_errors(path, "expected 'transform' of 3x4 numbers and 'scale'"):
-        transform = _to_square(data["transform"])
-        scale = to_number(data["scale"])
-    candidates = [*own, make_similarity(path, transform, scale)]
-    camera_data = read_json(cameras) if cameras is not None and cameras.suffix == ".json" and cameras.is_file() else {}
-    if isinstance(camera_data, dict) and "applied_transform" in camera_data:
-        with number_errors(cameras or path, "expected 'applied_transform' of 3x4 numbers"):
-            applied = _to_square(camera_data["applied_transform"])
-            factor = to_number(camera_data.get("applied_scale") or 1)
-            candidates.append(make_similarity(path, matmul(transform, invert(applied)), scale / factor))
+    candidates = [*_list_metashape_frames(cameras)] if cameras.suffix.lower() == ".xml" else []
+    paths = list_dataparsers(ply, cameras)
+    if not paths:
+        return [*candidates, *_read_offsets((ply.parent, cameras.parent), cameras)]
+    camera_data = read_json(cameras) if cameras.suffix == ".json" and cameras.is_file() else {}
+    for path in paths:
+        data = read_json(path)
+        with number_errors(path, "expected 'transform' of 3x4 numbers and 'scale'"):
+            transform = _to_square(data["transform"])
+            scale = to_number(data["scale"])
+        candidates.append(make_similarity(path, transform, scale))
+        if isinstance(camera_data, dict) and "applied_transform" in camera_data:
+            with number_errors(cameras, "expected 'applied_transform' of 3x4 numbers"):
+                applied = _to_square(camera_data["applied_transform"])
+                factor = to_number(camera_data.get("applied_scale") or 1)
+                candidates.append(make_similarity(path, matmul(transform, invert(applied)), scale / factor))
     return candidates
 
 
-def _read_offsets(folders: Sequence[Path], cameras: Path | None) -> list[Similarity]:
+def _read_offsets(folders: Sequence[Path], cameras: Path) -> list[Similarity]:
     """Read the offsets in metres that surveys subtract from coordinates; return moves of the cameras by each offset.
 
     An offset is three numbers that stand alone in a line or element of a small file. Metashape and CloudCompare write

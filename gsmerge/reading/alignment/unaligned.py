@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from itertools import chain, product
+from pathlib import Path
 
 import numpy as np
 
@@ -258,7 +259,7 @@ def choose_cameras(
         raise UnseenError(no_pixels.path, f"{no_pixels.problem}; {MIRRORED}", UNMIRROR)
     if not check.ok:
         remedy = f"{no_pixels.remedy}, or write their shift (x y z) to offset.txt beside the file"
-        remedy += ", or copy nerfstudio's dataparser_transforms.json there"
+        remedy += f", or copy nerfstudio's dataparser_transforms.json to {Path(no_pixels.path).parent}"
         if check.share_seen > 0.5:  # the views see most Gaussians, so only the colours contradict the cameras
             remedy += "; if the cameras are right, the photos or the colours of the file are wrong: --images none keeps"
             remedy += " the cameras, and --hint colors=rgb reads f_dc as RGB"

@@ -15,7 +15,9 @@ from tiny_scene import FLIP, Tiny, frames_of, rotation, write_colmap_text, write
 
 from gsmerge.errors import SceneError
 from gsmerge.io.cameras.dataparser import DATAPARSER
+from gsmerge.jobs.content_hash import list_files
 from gsmerge.reading.held_out import read_into_frame
+from gsmerge.reading.loaded import Loaded
 from gsmerge.reading.read_scene import load_scene
 
 SMOOTH = smooth_scene(24, 18)
@@ -45,8 +47,7 @@ def words(numbers: np.ndarray) -> str:
     return " ".join(map(repr, numbers.reshape(-1).tolist()))
 
 
-def assert_moved(folder: Path) -> None:
-    loaded = load_scene(folder)
+def assert_moved(loaded: Loaded) -> None:
     assert NOTE in loaded.notes
     centres = SCALE * (SMOOTH.c2w[:, :3, 3] @ TURN.T + SHIFT)
     assert np.allclose(loaded.scene.cameras.centres, centres)
@@ -57,7 +58,7 @@ def assert_moved(folder: Path) -> None:
 def test_cameras_of_the_capture_are_moved_into_the_frame_of_gaussians(tmp_path: Path) -> None:
     save_trained(tmp_path)
     write_colmap_text(tmp_path / "sparse", SMOOTH)
-    assert_moved(tmp_path)
+    assert_moved(load_scene(tmp_path))
 
 
 @pytest.mark.parametrize("cycled", [False, True], ids=["as it is", "in nerfstudio's axes"])
@@ -78,6 +79,25 @@ def test_cameras_of_metashape_are_moved_by_the_transform_of_its_chunk(tmp_path: 
     axes = " and turned from axes x, y, z to z, x, y, as the photos' colours show" if cycled else ""
     assert f"the cameras are moved by the transform of the chunk in cameras.xml{axes}" in loaded.notes
     assert np.allclose(loaded.scene.cameras.centres, SCALE * (SMOOTH.c2w[:, :3, 3] @ TURN.T + SHIFT))
+
+
+@pytest.mark.parametrize("place", ["data/desk", "outputs/desk/splatfacto/2026-01-02_030405"])
+@pytest.mark.parametrize("named", ["data/desk", "data/desk/colmap/sparse/0"])
+def test_the_dataparser_file_is_found_where_nerfstudio_leaves_it(tmp_path: Path, place: str, named: str) -> None:
+    """It keeps exports, captures and outputs apart; of several outputs, the one that fits is taken."""
+    save_trained(tmp_path / "exports" / "splat")
+    (tmp_path / "data" / "desk").mkdir(parents=True)
+    (tmp_path / "exports" / "splat" / "images").rename(tmp_path / "data" / "desk" / "images")
+    write_transforms(tmp_path / "data" / "desk" / "transforms.json", SMOOTH)
+    write_colmap_text(tmp_path / "data" / "desk" / "colmap" / "sparse" / "0", SMOOTH)
+    folders = [tmp_path / place] if place.startswith("data") else [tmp_path / place, tmp_path / f"{place}9"]
+    for folder, scale in zip(folders, (SCALE, 2.0), strict=False):
+        folder.mkdir(parents=True, exist_ok=True)
+        write_dataparser(folder, scale=scale)
+    (tmp_path / "exports" / "splat" / DATAPARSER).unlink()
+    loaded = load_scene(tmp_path / "exports" / "splat", cameras=tmp_path / named)
+    assert_moved(loaded)
+    assert set(folders) <= {path.parent for path in list_files(loaded.files)}
 
 
 def test_cameras_of_a_path_are_moved_as_those_of_the_capture(tmp_path: Path) -> None:
@@ -109,7 +129,7 @@ def test_poses_with_an_applied_transform_are_moved_by_the_rest(tmp_path: Path) -
     own[:3, :3] = TURN @ applied[:3, :3].T
     own[:3, 3] = 2 * (SHIFT - own[:3, :3] @ applied[:3, 3])
     write_dataparser(tmp_path, transform=(own @ applied)[:3].tolist(), scale=SCALE / 2 * 2)
-    assert_moved(tmp_path)
+    assert_moved(load_scene(tmp_path))
 
 
 def test_a_dataparser_file_that_does_not_help_is_not_applied(tmp_path: Path) -> None:
@@ -124,7 +144,7 @@ def test_cameras_of_the_capture_are_refused_without_the_dataparser_file(tmp_path
     save_trained(tmp_path)
     write_colmap_text(tmp_path / "sparse", SMOOTH)
     (tmp_path / "dataparser_transforms.json").unlink()
-    with refuses(SceneError, "scene.ply", 1296, 864):
+    with refuses(SceneError, "scene.ply", 1296, 864, tmp_path):
         load_scene(tmp_path, cameras=tmp_path / "sparse")
 
 
