@@ -88,11 +88,15 @@ def fit_frame(cameras: Cameras, poses: np.ndarray, scale: float | None) -> Simil
 
 
 def describe_frame(frame: Similarity) -> Similarity:
-    """Return a similarity with a description in words."""
-    angle = np.degrees(arccos(np.clip((np.trace(frame.rotation) - 1) / 2, -1, 1)))
-    shift = ", ".join(f"{value:.4g}" for value in frame.shift)
-    text = f"rotated by {angle:.1f} degrees, positions scaled by {frame.scale:.4g} and shifted by {shift}"
-    return replace(frame, description=text)
+    """Return a similarity with a description in words, which leaves out what the similarity does not change."""
+    angle = f"{np.degrees(arccos(np.clip((np.trace(frame.rotation) - 1) / 2, -1, 1))):.1f}"
+    scale = f"{frame.scale:.4g}"
+    text = "moved" if angle == "0.0" else f"rotated by {angle} degrees"
+    moves = [] if scale == "1" else [f"scaled by {scale}"]
+    same_place = 1e-4  # shifts are errors below it, in units of the cameras' world
+    if np.abs(frame.shift).max() > same_place * frame.scale:
+        moves.append(f"shifted by {', '.join(f'{value:.4g}' for value in frame.shift)}")
+    return replace(frame, description=f"{text}, positions {' and '.join(moves)}" if moves else text)
 
 
 def ray_directions(pairs: Correspondences, cameras: Cameras) -> tuple[np.ndarray, np.ndarray]:
