@@ -117,7 +117,7 @@ _TRANSFORMS_JSON = ViewLayout(
 _LONG_LRM = ViewLayout(
     views="frames",
     name=("file_path", "image_path"),
-    pose=Matrix("w2c", (4, 4)),
+    pose=Matrix("w2c"),
     K=PinholeKeys("fx", "fy", "cx", "cy"),
     size=("w", "h"),
     finish=move_to_gaussians,
@@ -131,9 +131,9 @@ _INRIA = ViewLayout(
     finish=_lazy("npz_files.take_optimised_poses"),
 )
 _GLOBALSPLAT = ViewLayout(
-    views="views", name=("file", "image"), pose=Matrix("c2w", (4, 4)), K=Matrix("intrinsic", (3, 3)), size="image_shape"
+    views="views", name=("file", "image"), pose=Matrix("c2w"), K=Matrix("intrinsic"), size="image_shape"
 )
-_FFGS = replace(_GLOBALSPLAT, K=Matrix("k_normalized", (3, 3)), unit="size")
+_FFGS = replace(_GLOBALSPLAT, K=Matrix("k_normalized"), unit="size")
 _WORLD_MIRROR = ViewLayout(
     views=join_matrices, pose=Matrix("extrinsics"), K=Matrix("intrinsics"), finish=set_centred_size
 )

@@ -52,16 +52,9 @@ class Entry(NamedTuple):
 
 @dataclass(frozen=True)
 class Matrix:
-    """A matrix under one key.
-
-    Args:
-        key: The key.
-        shape: Shape of the matrix, if files may list all its numbers in one flat list. None if files have a list for
-            each row.
-    """
+    """A matrix under one key, as a list for each row or as one flat list, row by row."""
 
     key: str
-    shape: tuple[int, int] | None = None
 
     @property
     def keys(self) -> tuple[str, ...]:
@@ -70,14 +63,13 @@ class Matrix:
 
     def read(self, values: Mapping[str, Any]) -> np.ndarray:
         """Read the matrix; errors as in :func:`convert_value`."""
-        shape = self.shape
-        return np.asarray(
-            convert_value(
-                lambda value: to_array(value) if shape is None else to_array(value).reshape(shape),
-                self.key,
-                values[self.key],
-            )
-        )
+        return np.asarray(convert_value(_to_matrix, self.key, values[self.key]))
+
+
+def _to_matrix(value: Any) -> np.ndarray:
+    """Convert lists of numbers to a matrix; nine numbers of a flat list are 3x3, others rows of four."""
+    numbers = to_array(value)
+    return numbers.reshape(-1, 3 if numbers.size == 9 else 4) if numbers.ndim == 1 else numbers
 
 
 def rotation_of_matrix(numbers: np.ndarray) -> np.ndarray:
@@ -224,8 +216,12 @@ def read_views(source: CameraSource, layout: ViewLayout) -> StoredCameras:
             cameras.append((path, name, layout.pose.read(entry.values), values))
     has_intrinsics = any(key in values for *_, values in cameras for key in ("K", *_FOCAL))
     size_of = cache(image_size)  # many views may name the same photo
+    # engines write matrices column by column, in which every pose ends in 0, 0, 0, 1 downward
+    have_no_shift = all(pose.shape == (4, 4) and not pose[:3, 3].any() for _, _, pose, _ in cameras)
+    by_columns = have_no_shift and any(pose[3, :3].any() for _, _, pose, _ in cameras)
     views = []
-    for path, name, pose, values in cameras:
+    for path, name, stored, values in cameras:
+        pose = stored.T if by_columns else stored
         with number_errors(path, f"view {name}: expected numbers"):
             lens = _lens(path, name, values) if layout.lens else None
             K = None

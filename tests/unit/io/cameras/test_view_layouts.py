@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 from messages import refuses
-from program_cameras import C2W, CX, CY, FORMATS, FX, FY, HEIGHT, K_DIVIDED, NAMES, VIEWS, W2C, WIDTH, K
-from tiny_scene import edited_json, rotation
+from program_cameras import C2W, C2W_OPENGL, CX, CY, FORMATS, FX, FY, HEIGHT, K_DIVIDED, NAMES, VIEWS, W2C, WIDTH, K
+from tiny_scene import FLIP, edited_json, rotation
 
 from gsmerge.errors import SceneError
 from gsmerge.io import read_cameras, to_cameras
@@ -21,6 +21,7 @@ from gsmerge.io.cameras.table import CAMERA_FORMATS
 from gsmerge.io.cameras.view_layout import PinholeKeys, RotationAndShift, ViewLayout, read_views
 from gsmerge.method.geometry.transforms import mean_pose_frame, quat_to_rotmat, rotmat_to_quat
 from gsmerge.method.kernels.elementary import arctan2
+from gsmerge.method.kernels.matrices import invert, matmul
 
 Change = Callable[[Any], object]
 ANGLE = 2 * float(arctan2(0.5, 1.0))  # of view: the focal length is the side's length
@@ -66,6 +67,19 @@ def test_a_new_layout_is_declared_without_a_function(tmp_path: Path) -> None:
     path.write_text(path.read_text().replace('"f"', '"g"').replace('"t"', '"s"'))
     with refuses(SceneError, "new.json: view 0", "'t'", "'focal' or 'f'"):
         read_views(CameraSource(path), layout)
+
+
+@pytest.mark.parametrize("by", [np.ravel, lambda pose: pose[:3].ravel(), lambda pose: pose.T.ravel(), np.transpose])
+def test_poses_may_be_flat_or_written_column_by_column(tmp_path: Path, by: Callable[[np.ndarray], np.ndarray]) -> None:
+    """As scripts of engines write them; one camera may stand at the origin."""
+    poses = C2W_OPENGL.copy()
+    poses[0, :3, 3] = 0
+    path = FORMATS["transforms.json"].write(tmp_path)
+    data = json.loads(path.read_text())
+    for frame, pose in zip(data["frames"], poses, strict=True):
+        frame["transform_matrix"] = by(pose).tolist()
+    path.write_text(json.dumps(data))
+    np.testing.assert_allclose(invert(read_cameras(path).viewmats), matmul(poses, FLIP), atol=1e-9)
 
 
 def in_views(*drop: str, **values: Any) -> Change:
