@@ -178,7 +178,7 @@ def choose_photos(shown: Evidence, bare: Evidence, views: Views) -> Evidence:
     concerns_photos = is_photo or cause.path == str(folder) or not views.photos.named
     if not (bare.are_pixels or concerns_photos or views.photos.by_names):
         return shown
-    left_out = leave_out(bare, replace(views.files, images=folder), [f"the photos in {folder}"], cause)
+    left_out = leave_out(bare, replace(views.files, images=folder), [f"the photos in {folder or cause.path}"], cause)
     return replace(left_out, photo_error=cause)
 
 

@@ -10,6 +10,7 @@ from gsmerge.errors import SceneError
 from gsmerge.frozen import dataclass, replace
 from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, select_views, to_cameras, with_convention
 from gsmerge.io.cameras.read_cameras import read_cameras
+from gsmerge.io.cameras.table import IN_SPLAT_FRAME
 from gsmerge.io.image_names import find_image
 from gsmerge.io.photo_files import as_floats, photo_size
 from gsmerge.method.geometry.transforms import IDENTITY, Similarity, camera_centres, fit_similarity
@@ -105,6 +106,8 @@ def read_into_frame(load: Loaded, path: Path) -> tuple[CameraFile, dict[int, int
     their indices in the scene. Frame and convention are found as in :func:`read_held_out`.
     """
     stored = read_cameras(path)
+    if stored.source in IN_SPLAT_FRAME:
+        return stored, {}
     own_cameras = load.cameras
     conventions = [stored]  # the cameras of the file, read in each convention
     if own_cameras is not None and own_cameras.source == stored.source and own_cameras.convention != stored.convention:

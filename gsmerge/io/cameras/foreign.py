@@ -94,8 +94,6 @@ PROGRAMS = (
     Foreign("odometry.csv", "Stray Scanner", _WRITE_POSES, "timestamp"),
     Foreign("camera/*.npz poses.npz", "CUT3R or Spann3R", _WRITE_POSES, "pose"),
     Foreign("disps.npy tstamps.npy reconstruction.pth", "DROID-SLAM", _WRITE_POSES),
-    Foreign("*.json", "a path of nerfstudio's viewer, or ns-export", "name the transforms.json of the capture",
-           r'"camera_path"\s*:|^\[\s*\{[^{}]*"transform"\s*:'),
     Foreign("*.psht", "Postshot", "name the cameras that were loaded into it"),
     Foreign("*.abc *.fbx *.chan *.blend *.ma", "3D programs", "BlenderNeRF, in Blender, writes transforms_train.json"),
 )  # fmt: skip

@@ -1,11 +1,13 @@
 """Read the views of programs whose files no :class:`ViewLayout` alone describes.
 
-OpenSfM, Polycam and WorldMirror write the values of a view into several lists or files. Long-LRM moves its cameras, and
-SHARP writes its camera into the elements of its ``.ply``.
+OpenSfM, Polycam, WorldMirror and nerfstudio's exports write the values of a view into several lists or files. Long-LRM
+moves its cameras, and SHARP writes its camera into the elements of its ``.ply``.
 """
 
 from __future__ import annotations
 
+import math
+import os
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -21,7 +23,7 @@ from gsmerge.io.cameras.camera_file import (
     check_camera_count,
     make_pinhole,
 )
-from gsmerge.io.cameras.camera_source import CameraSource, StoredCameras, number_errors
+from gsmerge.io.cameras.camera_source import CameraSource, StoredCameras, check_objects, number_errors, to_number
 from gsmerge.io.cameras.view_layout import Entry
 from gsmerge.io.formats.table import PLY, find_format
 from gsmerge.io.image_names import natural_key, natural_order
@@ -59,6 +61,32 @@ def list_keyframes(source: CameraSource) -> list[Entry]:
             pose = [[values[f"t_{row}{column}"] for column in range(4)] for row in range(3)]
         entries.append(Entry({**values, "transform": pose}, name=path.stem, path=path))
     return entries
+
+
+def list_path(source: CameraSource) -> list[Entry]:
+    """List the views of a path of nerfstudio's viewer, which has vertical fields of view in degrees."""
+    with number_errors(source.path, "expected a 'camera_path' of objects with 'fov'"):
+        views = source.object["camera_path"]
+        return [
+            Entry({**view, "camera_angle_y": math.radians(to_number(view["fov"]))}, source.object) for view in views
+        ]
+
+
+def list_exported_cameras(source: CameraSource) -> list[Entry]:
+    """List what `ns-export cameras` writes, with the intrinsics of the ``transforms.json`` beside it or the photos.
+
+    Raise SceneError if there is no ``transforms.json``.
+    """
+    check_objects(source.path, source.json)
+    max_folders = 8  # above a photo
+    photo = source.path.parent / str(source.first.get("file_path"))
+    captures = (folder / "transforms.json" for folder in (source.path.parent, *photo.parents[:max_folders]))
+    capture = next(filter(os.path.isfile, captures), None)
+    if capture is None:
+        problem = "expected the capture's transforms.json with the intrinsics, which ns-export leaves out, found none"
+        raise SceneError(source.path, problem, "copy it beside this file")
+    shared = CameraSource(capture).object
+    return [Entry(view, shared) for view in source.json]
 
 
 def join_matrices(source: CameraSource) -> list[Entry]:

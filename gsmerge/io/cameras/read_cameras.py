@@ -15,6 +15,7 @@ from gsmerge.io.cameras.foreign import BESIDE_POSES, CAMERA_PLACES, check_progra
 from gsmerge.io.cameras.table import (
     CAMERA_ENDINGS,
     CAMERA_FORMATS,
+    IN_SPLAT_FRAME,
     KEYFRAME,
     SHARP_PLY,
     is_colmap,
@@ -92,7 +93,7 @@ def holds_cameras(path: Path) -> bool:
     if path.suffix == ".npz":
         return bool(_holds_poses(path))
     try:
-        return len(read_cameras(path)) > 0
+        return read_cameras(path).source != IN_SPLAT_FRAME[0]  # a path is for clips
     except SceneError:
         return False
 

@@ -25,7 +25,9 @@ from gsmerge.io.cameras.programs import (
     SHARP,
     is_long_lrm,
     join_matrices,
+    list_exported_cameras,
     list_keyframes,
+    list_path,
     list_shots,
     move_to_gaussians,
     read_sharp,
@@ -45,6 +47,8 @@ from gsmerge.runtime.plugins import LazyFunction, lazy_functions
 
 _lazy = lazy_functions(__package__)
 FFGS = "ffgs cameras.json"  # a format whose photos were resized until they cover the model's input, and cropped
+# Formats of nerfstudio whose cameras are in the world of its splat already: the path of a viewer comes first
+IN_SPLAT_FRAME = ("nerfstudio path", "ns-export cameras")
 KEYFRAME = "t_00"  # key by which files of Polycam are recognised; it is within their first bytes
 
 
@@ -113,6 +117,10 @@ _TRANSFORMS_JSON = ViewLayout(
     mask="mask_path",
     lens="camera_model",
     optional=("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_model"),
+)
+_EXPORTED = replace(_TRANSFORMS_JSON, views=list_exported_cameras, pose=Matrix("transform"))
+_PATH = replace(
+    _TRANSFORMS_JSON, views=list_path, pose=Matrix("camera_to_world"), size=("render_width", "render_height")
 )
 _LONG_LRM = ViewLayout(
     views="frames",
@@ -197,6 +205,12 @@ CAMERA_FORMATS = (
     CameraFormat("transforms.json", "`transforms.json` of nerfstudio, instant-ngp; `transforms_train.json` of Blender",
                  ".json", _TRANSFORMS_JSON, C2W_OPENGL, "pixels or field of view; may be missing; lenses",
                  lambda file: "frames" in file.object),
+    CameraFormat(IN_SPLAT_FRAME[0], "`camera_path.json` of nerfstudio's viewer, for `render --path`", ".json",
+                 lambda file: read_views(file, _PATH), C2W_OPENGL, "field of view",
+                 lambda file: "camera_path" in file.object),
+    CameraFormat(IN_SPLAT_FRAME[1], "`transforms_train.json` of `ns-export cameras`", ".json",
+                 lambda file: read_views(file, _EXPORTED), C2W_OPENGL, "in the capture's `transforms.json`",
+                 lambda file: "transform" in file.first),
     CameraFormat("frame list", "list of frames with `transform_matrix`", ".json", replace(_TRANSFORMS_JSON, views=""),
                  C2W_OPENCV, "pixels or field of view; may be missing; lenses",
                  lambda file: "transform_matrix" in file.first),

@@ -114,6 +114,17 @@ def test_cameras_of_a_path_are_moved_as_those_of_the_capture(tmp_path: Path) -> 
     np.testing.assert_allclose(placed.viewmats, expected, atol=1e-6)
 
 
+def test_a_path_of_nerfstudios_viewer_is_in_the_world_of_the_gaussians(tmp_path: Path) -> None:
+    save_trained(tmp_path)
+    write_colmap_text(tmp_path / "sparse", SMOOTH)
+    views = [{"camera_to_world": pose.ravel().tolist(), "fov": 50} for pose in SMOOTH.c2w @ FLIP]
+    data = {"render_height": 20, "render_width": 30, "camera_path": views}
+    (path := tmp_path / "path.json").write_text(json.dumps(data))
+    placed, shared = read_into_frame(load_scene(tmp_path), path)
+    assert shared == {}
+    np.testing.assert_allclose(placed.viewmats, SMOOTH.w2c, atol=1e-6)
+
+
 def test_poses_with_an_applied_transform_are_moved_by_the_rest(tmp_path: Path) -> None:
     """The poses are in the world after ``applied_transform``, but ``transform`` starts from the world before it."""
     save_trained(tmp_path)

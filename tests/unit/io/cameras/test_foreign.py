@@ -60,7 +60,6 @@ FILES = [
     ("disps.npy", "\x93NUMPY", "DROID-SLAM", "views.npz"),
     ("camera/000000.npz", "PK\3\4 pose.npy", "CUT3R", "views.npz"),
     ("trajectory.json", '{\n\t"class_name" : "PinholeCameraTrajectory"', "Open3D", "transforms.json"),
-    ("transforms_train.json", '[\n {"file_path": "a.png", "transform": [[', "ns-export", "of the capture"),
     ("a.psht", "\0", "Postshot", "loaded into it"),
     ("a.blend", "BLENDER", "3D programs", "BlenderNeRF"),
 ]  # fmt: skip

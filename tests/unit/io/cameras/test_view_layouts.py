@@ -82,6 +82,40 @@ def test_poses_may_be_flat_or_written_column_by_column(tmp_path: Path, by: Calla
     np.testing.assert_allclose(invert(read_cameras(path).viewmats), matmul(poses, FLIP), atol=1e-9)
 
 
+def test_a_path_of_nerfstudios_viewer_is_read_but_no_scene_has_it(tmp_path: Path) -> None:
+    path = tmp_path / "camera_path.json"
+    fov = float(np.degrees(ANGLE))
+    views = [{"camera_to_world": pose.ravel().tolist(), "fov": fov, "aspect": 1.5} for pose in C2W_OPENGL]
+    path.write_text(json.dumps({"render_height": HEIGHT, "render_width": WIDTH, "camera_path": views}))
+    cameras = read_cameras(path)
+    np.testing.assert_allclose(cameras.viewmats, W2C, atol=1e-9)
+    np.testing.assert_allclose(cameras.Ks[0], diagonal(HEIGHT, HEIGHT), atol=1e-9)
+    assert (cameras.widths == WIDTH).all()
+    assert find_other_cameras(tmp_path) is None
+    path.write_text(path.read_text().replace('"fov"', '"f"'))
+    with refuses(SceneError, "camera_path.json", "'fov'"):
+        read_cameras(path)
+
+
+@pytest.mark.parametrize("beside", [True, False], ids=["beside it", "above the photos"])
+def test_cameras_of_ns_export_have_the_intrinsics_of_the_capture(tmp_path: Path, beside: bool) -> None:
+    folder = tmp_path / "exports" / "cameras"
+    folder.mkdir(parents=True)
+    capture = FORMATS["transforms.json"].write(folder if beside else tmp_path / "data")
+    views = [
+        {"file_path": str(tmp_path / "data" / "images" / name), "transform": pose[:3].tolist()}
+        for name, pose in zip(NAMES, C2W_OPENGL, strict=True)
+    ]
+    path = folder / "transforms_eval.json"
+    path.write_text(json.dumps(views))
+    cameras = read_cameras(path)
+    np.testing.assert_allclose(cameras.viewmats, W2C, atol=1e-9)
+    np.testing.assert_allclose(cameras.Ks[0], K)
+    capture.unlink()
+    with refuses(SceneError, "transforms_eval.json", "transforms.json"):
+        read_cameras(path)
+
+
 def in_views(*drop: str, **values: Any) -> Change:
     """Change the values of each view, or drop keys."""
 
