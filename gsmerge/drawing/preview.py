@@ -66,10 +66,8 @@ def save_picture(path: Path, picture: BytePicture, *, overwrite: bool = True) ->
         raise SceneError(path, problem, "name a .png, or lower --size")
     channels = [2, 1, 0, 3][: picture.shape[-1]]  # the order of OpenCV
     _, data = cv2.imencode(path.suffix, np.ascontiguousarray(picture[..., channels]))
-    if path.suffix.lower() == ".png":
-        data = mark_drawn(data)
     with atomic_output(path, overwrite=overwrite) as temporary:
-        temporary.write_bytes(data.tobytes())
+        temporary.write_bytes(mark_drawn(data.tobytes()))
 
 
 def label(picture: BytePicture, text: str) -> BytePicture:

@@ -19,6 +19,8 @@ OTHER_SUFFIXES = frozenset(ending for _, endings, _ in OTHER_PICTURES for ending
 FILMS = frozenset(ending for ending, (content, _) in FOREIGN.items() if content == FILM)
 # Last bytes of the videos that gsmerge writes, which no other video has. Players skip these bytes as an unknown part
 CLIP_ENDS = {".mp4": b"\0\0\0\x0ffreegsmerge", ".webm": b"\xec\x87gsmerge"}
+DRAWN = b"Software\0gsmerge render"  # mark of pictures that gsmerge drew, see gsmerge.io.photo_files.mark_drawn
+PNG_START = 33  # bytes of a PNG before its second chunk
 _CUT_FILM = "save the frames that the model saw as photos, with ffmpeg -i FILM photos/%05d.jpg"
 IMAGE_PLACES = (  # places in a folder at which the photos of a scene may lie
     "images_resized",  # photos as WorldMirror saw them; in its images/, tall photos are squeezed
@@ -202,6 +204,16 @@ def is_clip(video: Path) -> bool:
     with suppress(OSError), video.open("rb") as file:
         file.seek(-len(end), os.SEEK_END)
         return bool(end) and file.read() == end
+    return False
+
+
+def is_drawn(picture: Path) -> bool:
+    """Return whether the first or last bytes of a picture show that gsmerge drew it; False if it cannot be read."""
+    with suppress(OSError), picture.open("rb") as file:
+        if DRAWN in file.read(PNG_START + len("size") + len("tEXt") + len(DRAWN)):
+            return True
+        file.seek(-len(DRAWN), os.SEEK_END)
+        return file.read() == DRAWN
     return False
 
 

@@ -19,7 +19,7 @@ from gsmerge.errors import SceneError
 from gsmerge.frozen import dataclass, replace
 from gsmerge.io.bounds import MAX_PIXELS, ReadBudget, check_file, check_image_size, read_errors
 from gsmerge.io.first_bytes import refuse_picture
-from gsmerge.io.image_names import ImageSource, match_images
+from gsmerge.io.image_names import DRAWN, PNG_START, ImageSource, match_images
 from gsmerge.method.kernels.matrices import matmul
 from gsmerge.method.kernels.pictures import turn_picture
 from gsmerge.runtime.memory import free_pages, make_array
@@ -64,9 +64,6 @@ _PNG_CHUNKS = frozenset({b"IHDR", b"PLTE", b"tRNS", b"IDAT"})  # chunks that det
 Size = tuple[int, int]  # width and height in pixels
 Part = tuple[float, float, float, float]  # left, top, right and bottom of a part of a photo, as shares of its sides
 WHOLE: Part = (0.0, 0.0, 1.0, 1.0)  # all of a photo
-# mark of a drawing, and bytes of a PNG before its second chunk
-_DRAWN = b"Software\0gsmerge render"
-_PNG_START = 33
 _AT_ONCE = 128 << 20  # most bytes of decoded photos in memory; if they need more, photos are decoded at each use
 
 
@@ -331,18 +328,16 @@ def _decode_brightness(path: Path, budget: ReadBudget) -> np.ndarray:
         return grey
 
 
-def mark_drawn(png: np.ndarray) -> np.ndarray:
-    """Mark the bytes of a ``.png`` as a drawing of gsmerge, so that a search for photos passes it by."""
-    chunk = b"tEXt" + _DRAWN
-    text = struct.pack(">I", len(_DRAWN)) + chunk + struct.pack(">I", zlib.crc32(chunk))
-    return np.concatenate([png[:_PNG_START], np.frombuffer(text, np.uint8), png[_PNG_START:]])
+def mark_drawn(data: bytes) -> bytes:
+    """Mark the bytes of a picture as a drawing of gsmerge, so that no search for photos takes it.
 
-
-def is_drawn(path: Path) -> bool:
-    """Return whether :func:`mark_drawn` marked a picture; False for a file that cannot be read."""
-    with suppress(OSError), path.open("rb") as file:
-        return _DRAWN in file.read(_PNG_START + 8 + len(_DRAWN))
-    return False
+    Decoders of other formats than PNG ignore what follows the last pixel, so that their mark is there.
+    """
+    if not data.startswith(PNG):
+        return data + DRAWN
+    chunk = b"tEXt" + DRAWN
+    text = struct.pack(">I", len(DRAWN)) + chunk + struct.pack(">I", zlib.crc32(chunk))
+    return data[:PNG_START] + text + data[PNG_START:]
 
 
 def decode_alpha(path: Path) -> np.ndarray | None:

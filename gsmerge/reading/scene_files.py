@@ -36,7 +36,7 @@ from gsmerge.io.formats.table import (
     find_format,
     may_hold_gaussians,
 )
-from gsmerge.io.image_names import IMAGE_PLACES, check_photo_folder, list_images, match_masks, natural_order
+from gsmerge.io.image_names import IMAGE_PLACES, check_photo_folder, is_drawn, list_images, match_masks, natural_order
 from gsmerge.runtime.plugins import LazyFunction
 from gsmerge.runtime.record import list_some
 from gsmerge.settings.reading import NONE
@@ -290,7 +290,7 @@ def _find_pictures(option: str, places: Sequence[str], roots: Sequence[Path], pl
     # If a folder has several scenes, each may have its own folder of pictures, with the name of the scene
     names = ply.stem, os.path.basename(os.path.realpath(ply.parent))
     for root, folder in [*((root, folder / name) for root, folder in folders for name in names), *folders]:
-        picture_folders = {picture.parent for picture in list_images(folder)}
+        picture_folders = {picture.parent for picture in list_images(folder) if not is_drawn(picture)}
         if picture_folders and not any(_is_in_other_scene(place, root, ply) for place in picture_folders):
             return folder
     return None

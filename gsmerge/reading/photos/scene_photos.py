@@ -23,7 +23,7 @@ from gsmerge.io.cameras.programs import SHARP
 from gsmerge.io.cameras.read_cameras import read_cameras
 from gsmerge.io.cameras.table import FFGS
 from gsmerge.io.first_bytes import CONVERT
-from gsmerge.io.image_names import IMAGE_SUFFIXES, find_image, list_images, natural_order, propose_images
+from gsmerge.io.image_names import IMAGE_SUFFIXES, find_image, is_drawn, list_images, natural_order, propose_images
 from gsmerge.io.photo_files import (
     ASPECT_TOLERANCE,
     PhotoArrays,
@@ -33,7 +33,6 @@ from gsmerge.io.photo_files import (
     decode_small,
     extend_picture,
     image_size,
-    is_drawn,
     orientation_turn,
     part_size,
     same_shape,
@@ -133,8 +132,8 @@ def is_without_names(camera_file: CameraFile) -> bool:
 def find_photos(files: SceneFiles, camera_file: CameraFile) -> ScenePhotos:
     """Find a photo for every camera by names, or if no name fits, by order if there is one file per camera.
 
-    Files that cannot be read are left out. Photos inside another file are read. The result is :data:`NO_PHOTOS` if
-    there are none.
+    Files that cannot be read are left out, and so are pictures that gsmerge drew, unless the user names a folder that
+    has no others. Photos inside another file are read. The result is :data:`NO_PHOTOS` if there are none.
     """
     names = camera_file.names
     if files.images is None and "images" not in files.named:
@@ -143,14 +142,16 @@ def find_photos(files: SceneFiles, camera_file: CameraFile) -> ScenePhotos:
         return NO_PHOTOS
     elif files.images.is_dir():
         folder = files.images
-        pool = list_images(files.images)
+        pictures = list_images(folder)
+        pool = [path for path in pictures if not is_drawn(path)]
+        pool = pool or (pictures if "images" in files.named else [])
         named = propose_images(folder, pool, names, count_pixels)
     else:
         same_file = files.cameras is not None and os.path.realpath(files.cameras) == os.path.realpath(files.images)
-        pictures = (camera_file if same_file else read_cameras(files.images)).images
-        if len(pictures) != len(names):
-            raise SceneError(files.images, f"expected {len(names)} images, one per camera, found {len(pictures)}")
-        return ScenePhotos(pictures=pictures)
+        stored = (camera_file if same_file else read_cameras(files.images)).images
+        if len(stored) != len(names):
+            raise SceneError(files.images, f"expected {len(names)} images, one per camera, found {len(stored)}")
+        return ScenePhotos(pictures=stored)
     better = None  # another folder, in which more cameras have a photo by name
     if "images" not in files.named and len(known := {*named} - {None}) < len(names) and names[0] != UNNAMED:
         roots = dict.fromkeys(path.absolute() for path in (capture_folder(Path(camera_file.path)), files.root) if path)
@@ -188,13 +189,14 @@ def _find_photos_near(files: SceneFiles, camera_file: CameraFile) -> tuple[Path,
     path = Path(camera_file.path)
     names = camera_file.names
     folder = capture_folder(path)
-    named = [find_image(folder, name, path, option=files.photo_option) for name in names]
+    found = (find_image(folder, name, path, option=files.photo_option) for name in names)
+    named = [None if photo is None or is_drawn(photo) else photo for photo in found]
     pool = list(dict.fromkeys(path for path in named if path is not None))
     are_numbers = all(name.removeprefix("view ").isdecimal() for name in names)  # the cameras have no names of photos
     if not pool and are_numbers:
         folder = files.ply.parent  # AnySplat writes its Gaussians among the photos
         beside = (path for path in folder.glob("[!.]*") if path.suffix.lower() in IMAGE_SUFFIXES)
-        pool = natural_order(path for path in beside if path.is_file())
+        pool = natural_order(path for path in beside if path.is_file() and not is_drawn(path))
     return folder, pool, named
 
 
@@ -218,14 +220,16 @@ def find_named_photos(
     cameras, with endings; a place below the first root, which is near the cameras; photos with colours, unlike masks
     and depths; photos of the size of the cameras, or of their shape; photos with more pixels.
 
-    Folders of pictures that gsmerge drew are passed by. Returns the folder, the photos of this folder and of the next
-    best folders, and the photo of each camera, or None for a camera without a photo. Returns None if no folder has
-    photos by name.
+    Pictures that gsmerge drew are no photos. Returns the folder, the photos of this folder and of the next best ones,
+    and the photo of each camera, None without one. Returns None if no folder has photos by name.
     """
     pools = dict[Path, dict[Path, None]]()  # folder -> photos in it and below
+    inner = [PurePath(name.replace("\\", "/")) for name in camera_file.names]
+    stems = {name.name for name in inner} | {name.stem for name in inner}
     for root in roots:
         for folder, names in list_folders(root):
             photos = [folder / name for name in names if PurePath(name).suffix.lower() in IMAGE_SUFFIXES]
+            photos = [path for path in photos if not ({path.name, path.stem} & stems and is_drawn(path))]
             for place in [folder, *(above for above in folder.parents if above.is_relative_to(root))]:
                 pools.setdefault(place, {}).update(dict.fromkeys(photos))
 
@@ -236,7 +240,7 @@ def find_named_photos(
         """Return a key that sorts better folders first: minus the number of cameras with a photo, then the criteria."""
         proposed = propose_images(folder, list(pools[folder]), camera_file.names, count_pixels)
         first = next(filter(count_pixels, filter(None, proposed)), None)
-        if first is None or is_drawn(first):
+        if first is None:
             return 0, folder
         camera_size = sizes[proposed.index(first)]
         size = image_size(first)
@@ -251,7 +255,7 @@ def find_named_photos(
     best = [folder for count, *_, folder in sorted(map(rank, pools)) if -count > num_known][:max_folders]
     if not best:
         return None
-    pool = list(dict.fromkeys(path for folder in best for path in pools[folder]))
+    pool = [path for path in dict.fromkeys(path for folder in best for path in pools[folder]) if not is_drawn(path)]
     return best[0], pool, propose_images(best[0], list(pools[best[0]]), camera_file.names, count_pixels)
 
 
@@ -508,6 +512,8 @@ def describe_assignment(photos: ScenePhotos, camera_file: CameraFile, *, are_pix
     place = f"photos are read from {list_some([*folders])}, whose files have the names of the cameras"
     count = len(photos.paths)
     notes = [place] if photos.by_names else []
+    if used and is_drawn(used[0][1]):  # then all are, see :func:`find_photos`
+        notes.append(Doubt("the photos that were named are pictures that gsmerge drew"))
     turned = [_short_path(path, photos) for view, path in used if photos.turns[view] != orientation_turn(path)]
     if turned:
         text = f"{len(turned)} of {count} photos are turned or mirrored relative to their orientation tags"

@@ -5,6 +5,8 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 from damage import SOUNDS
 from exports import export_rows, save_export
@@ -14,13 +16,17 @@ from tiny_scene import Tiny, make_tiny, write_inria
 
 from gsmerge import Compactor, read_scene
 from gsmerge.cli import main
+from gsmerge.drawing.preview import save_picture
 from gsmerge.errors import SceneError
 from gsmerge.io import read_ply, write_gaussians, write_ply
+from gsmerge.io.cameras.read_cameras import read_cameras
 from gsmerge.io.formats.ply import header_content
 from gsmerge.io.formats.rows import RESULT_COMMENT
+from gsmerge.io.image_names import is_drawn
 from gsmerge.jobs.batch.find import find_scenes
 from gsmerge.jobs.file_checks import check_content
 from gsmerge.reading.input import read_input
+from gsmerge.reading.photos.scene_photos import find_photos
 from gsmerge.reading.scene_files import find_scene_files
 from gsmerge.results.outputs import Outputs
 from gsmerge.run import compact_files
@@ -133,6 +139,31 @@ def test_headers_of_many_files_are_read_up_to_a_bound(
     monkeypatch.setattr("gsmerge.reading.scene_files._MAX_HEADERS", 1)
     with refuses(SceneError, folder, "2 (room.ply, z.ply)"):
         find_scene_files(folder)
+
+
+@pytest.mark.parametrize("ending", [".png", ".jpg", ".webp"])
+def test_what_gsmerge_drew_is_no_photo(folder: Path, tiny: Tiny, ending: str) -> None:
+    """Drawings with the names of the photos lie in the photos' place, or beside another capture; photos count."""
+    photos = folder / "images"
+    for name, photo in zip(tiny.names, tiny.images, strict=True):
+        foreign = folder / "a" / "photos" / Path(name).name
+        foreign.parent.mkdir(parents=True, exist_ok=True)
+        assert cv2.imwrite(str(foreign), np.random.default_rng(0).integers(0, 255, (60, 90, 3), np.uint8))
+        for place in (photos / name, folder / "a" / "drawn" / name):
+            place.parent.mkdir(parents=True, exist_ok=True)
+            place.unlink(missing_ok=True)
+            save_picture(place.with_suffix(ending), photo.astype(np.uint8))
+            assert is_drawn(place.with_suffix(ending))
+    cameras = read_cameras(folder / "transforms.json")
+    used = find_photos(find_scene_files(folder), cameras)
+    assert {path.parent for path in used.pool} == {folder / "a" / "photos"}
+    for name, photo in zip(tiny.names, tiny.images, strict=True):
+        (folder / "b" / name).parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(folder / "b" / Path(name).with_suffix(".png")), photo.astype(np.uint8)[..., ::-1])
+    assert {path.relative_to(folder).parts[0] for path in find_photos(find_scene_files(folder), cameras).paths} == {"b"}
+    named = read_input(find_scene_files(folder, images=photos))
+    assert noted(named.notes, "gsmerge drew")
+    assert named.scene.images is not None
 
 
 def test_feature_gaussians_are_no_scene(tmp_path: Path) -> None:
