@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from gsmerge.drawing.camera_path import outside_camera
 from gsmerge.errors import SceneError
 from gsmerge.io import atomic_output
-from gsmerge.io.photo_files import mark_drawn
+from gsmerge.io.image_names import mark_drawn
 from gsmerge.method.raster import render
 from gsmerge.method.raster.metrics import psnr, psnr_words
 from gsmerge.method.raster.photos import COVERED_TRANSMITTANCE, WHOLE_SHARE

@@ -11,7 +11,7 @@ from gsmerge.errors import SceneError
 from gsmerge.frozen import dataclass
 
 _PACKED_SCENES = (".spz", ".splat", ".sog", ".npz", ".glb", ".gsm")
-IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".jfif", ".webp", ".bmp", ".ppm"})
+IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".jfif", ".webp", ".bmp", ".ppm", ".tif", ".tiff", ".avif"})
 # Endings of files that are never text
 NO_TEXT = (".ply", *_PACKED_SCENES, *IMAGE_SUFFIXES - {".ppm"}, ".torch", ".safetensors", ".bin")
 _START = 1 << 10  # number of first bytes of a file that are compared with patterns
@@ -66,7 +66,6 @@ FOREIGN: dict[str, tuple[str, str]] = {
 _RAW = ".dng", ".raw", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".rw2", ".raf", ".pef", ".srw"
 # Formats of pictures that are not read: name, endings, and a pattern of the first bytes
 OTHER_PICTURES: tuple[tuple[str, tuple[str, ...], str], ...] = (
-    ("AVIF", (".avif",), r"(?s).{4}ftypavi[fs]"),
     ("HEIC", (".heic", ".heif", ".hif"), r"(?s).{4}ftyp(hei|hev|mif1|msf1)"),
     ("JPEG XL", (".jxl",), r"\xff\x0a|\0\0\0\x0cJXL "),
     ("JPEG 2000", (".jp2", ".j2k", ".jpx"), r"\xff\x4f\xff\x51|\0\0\0\x0cjP  "),
@@ -78,9 +77,10 @@ OTHER_PICTURES: tuple[tuple[str, tuple[str, ...], str], ...] = (
     ("Targa", (".tga",), r"(?!)"),  # has no mark at its start, so this pattern never matches
     ("SVG", (".svg",), r"(?:<\?xml[^>]*>)?\s*<svg"),
     ("raw", _RAW, r"(?s)FUJIFILMCCD-RAW|.{4}ftypcrx|II[RU][OS\0]"),  # other raw formats start like TIFF
-    ("TIFF", (".tif", ".tiff"), r"II[*+]\0|MM\0[*+]"),
+    ("BigTIFF", (), r"II\+\0|MM\0\+"),
 )
 CONVERT = "convert it to .jpg or .png"
+CONVERT_ALL = "convert all, keeping their names, with ImageMagick: mogrify -format jpg {files}"
 # If several entries of this table match a file, the first of these entries says what the file is
 OTHER_CONTENTS = (
     OtherContent("a Git LFS pointer", r"version https://git-lfs\.github\.com/spec/", "fetch it with: git lfs pull"),

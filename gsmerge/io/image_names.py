@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
+import struct
+import zlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
@@ -12,15 +15,15 @@ from typing import TypeVar
 
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import walk_files
-from gsmerge.io.first_bytes import FILM, FOREIGN, IMAGE_SUFFIXES, OTHER_PICTURES
+from gsmerge.io.first_bytes import CONVERT_ALL, FILM, FOREIGN, IMAGE_SUFFIXES, OTHER_PICTURES
 from gsmerge.types import StrPath
 
 OTHER_SUFFIXES = frozenset(ending for _, endings, _ in OTHER_PICTURES for ending in endings)  # of formats not read
 FILMS = frozenset(ending for ending, (content, _) in FOREIGN.items() if content == FILM)
 # Last bytes of the videos that gsmerge writes, which no other video has. Players skip these bytes as an unknown part
 CLIP_ENDS = {".mp4": b"\0\0\0\x0ffreegsmerge", ".webm": b"\xec\x87gsmerge"}
-DRAWN = b"Software\0gsmerge render"  # mark of pictures that gsmerge drew, see gsmerge.io.photo_files.mark_drawn
-PNG_START = 33  # bytes of a PNG before its second chunk
+_DRAWN = b"Software\0gsmerge render"  # mark of pictures that gsmerge drew
+_PNG_START = 33  # bytes of a PNG before its second chunk
 _CUT_FILM = "save the frames that the model saw as photos, with ffmpeg -i FILM photos/%05d.jpg"
 IMAGE_PLACES = (  # places in a folder at which the photos of a scene may lie
     "images_resized",  # photos as WorldMirror saw them; in its images/, tall photos are squeezed
@@ -194,8 +197,28 @@ def _describe_unread_files(files: Sequence[Path]) -> tuple[str, str] | None:
     counts = Counter(file.suffix.lower() for file in files)
     if num_pictures := sum(counts[ending] for ending in OTHER_SUFFIXES):
         endings = " and ".join(sorted(ending for ending in counts if ending in OTHER_SUFFIXES))
-        return f"{num_pictures} {endings}", "convert them to .jpg or .png, and keep their names"
+        first = next(file for file in files if file.suffix.lower() in OTHER_SUFFIXES)
+        return f"{num_pictures} {endings}", convert_all(first)
     return (FILM, _CUT_FILM) if any(file.suffix.lower() in FILMS and not is_clip(file) for file in files) else None
+
+
+def convert_all(picture: Path) -> str:
+    """Return the remedy for a picture of a format that is not read and for all others like it in its folder."""
+    return CONVERT_ALL.format(files=f"{shlex.quote(str(picture.parent))}/*{picture.suffix}")
+
+
+def describe_missing_image(folder: Path, name: str) -> str:
+    """Say that a file does not exist; also name a file of the same stem whose format is not read, if there is one."""
+    inner = PurePath(name)
+    same_stem = set[Path]()
+    for place in {folder, folder if inner.is_absolute() or ".." in inner.parts else folder / inner.parent}:
+        with suppress(OSError, ValueError):
+            same_stem |= {place / file for file in os.listdir(place) if PurePath(file).stem == inner.stem}
+    unread = {file for file in same_stem if file.suffix.lower() in OTHER_SUFFIXES}
+    short = inner.relative_to(folder.name) if inner.is_relative_to(folder.name) else inner  # without the folder's name
+    if not unread:
+        return f"{short}: no such file"
+    return f"{short}: the format {min(unread).suffix} is not read; {convert_all(min(unread))}"
 
 
 def is_clip(video: Path) -> bool:
@@ -207,13 +230,25 @@ def is_clip(video: Path) -> bool:
     return False
 
 
+def mark_drawn(data: bytes) -> bytes:
+    """Mark the bytes of a picture as a drawing of gsmerge, so that no search for photos takes it.
+
+    Decoders of other formats than PNG ignore what follows the last pixel, so that their mark is there.
+    """
+    if not data.startswith(b"\x89PNG"):
+        return data + _DRAWN
+    chunk = b"tEXt" + _DRAWN
+    text = struct.pack(">I", len(_DRAWN)) + chunk + struct.pack(">I", zlib.crc32(chunk))
+    return data[:_PNG_START] + text + data[_PNG_START:]
+
+
 def is_drawn(picture: Path) -> bool:
     """Return whether the first or last bytes of a picture show that gsmerge drew it; False if it cannot be read."""
     with suppress(OSError), picture.open("rb") as file:
-        if DRAWN in file.read(PNG_START + len("size") + len("tEXt") + len(DRAWN)):
+        if _DRAWN in file.read(_PNG_START + len("size") + len("tEXt") + len(_DRAWN)):
             return True
-        file.seek(-len(DRAWN), os.SEEK_END)
-        return file.read() == DRAWN
+        file.seek(-len(_DRAWN), os.SEEK_END)
+        return file.read() == _DRAWN
     return False
 
 

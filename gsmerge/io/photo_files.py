@@ -9,24 +9,25 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from importlib import import_module
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import cv2
 import numpy as np
-from PIL import Image
+from PIL import Image, features
 
 from gsmerge.errors import SceneError
 from gsmerge.frozen import dataclass, replace
 from gsmerge.io.bounds import MAX_PIXELS, ReadBudget, check_file, check_image_size, read_errors
-from gsmerge.io.first_bytes import refuse_picture
-from gsmerge.io.image_names import DRAWN, PNG_START, ImageSource, match_images
+from gsmerge.io.first_bytes import CONVERT, read_start, refuse_picture
+from gsmerge.io.image_names import ImageSource, match_images
 from gsmerge.method.kernels.matrices import matmul
 from gsmerge.method.kernels.pictures import turn_picture
 from gsmerge.runtime.memory import free_pages, make_array
 from gsmerge.runtime.threads import parallel_map, quiet_warnings
 from gsmerge.types import Cameras
 
-_FORMATS = ("JPEG", "WEBP", "BMP", "PPM")  # formats whose headers Pillow reads; headers of PNG are read here
+# Formats whose headers Pillow reads; headers of PNG are read here. Of the last two, Pillow also decodes the pixels
+_FORMATS = ("JPEG", "WEBP", "BMP", "PPM", "TIFF", "AVIF")
 # Orientation tag -> number of quarter turns counterclockwise, plus 4 if the photo is mirrored first
 _TURNS = {2: 4, 3: 2, 4: 6, 5: 5, 6: 3, 7: 7, 8: 1}
 _OPAQUE_SUFFIXES = frozenset({".jpg", ".jpeg", ".jfif", ".ppm"})
@@ -40,6 +41,7 @@ PNG_END = b"\0\0\0\0IEND\xaeB`\x82"
 _JPEG = b"\xff\xd8"
 _SCAN = b"\xff\xda"
 _PHOTO_MEMORY_PER_BYTE = 100  # bytes of memory per byte of a photo or mask that is decoded alone
+_AVIF_MEMORY_PER_BYTE = 1000  # a photo in AVIF may have a tenth of a bit per pixel
 _COPIES = 2, 3  # copies of all pixels in memory: while OpenCV decodes, and at most while Pillow decodes and converts
 _PILLOW_BYTES = {"1": 1, "L": 1, "P": 1, "I;16": 2}  # bytes of a pixel by Pillow's mode; 4 in all other modes
 # Bytes of memory for each pixel that a decoder needs besides the decoded pixel
@@ -47,8 +49,14 @@ _COEFFICIENT_BYTES = 2
 _WEBP_BYTES = 4
 _MOVING_WEBP_BYTES = 9
 _PILLOW_WEBP_BYTES = 10
+_TIFF_OR_AVIF_BYTES = 13
 # First bytes of an image file -> the plugin of Pillow that opens the file
-_PLUGINS = {PNG: "Png", _JPEG: "Jpeg", b"RIFF": "WebP", b"BM": "Bmp"}
+_TIFF = b"II*\0", b"MM\0*"
+_PLUGINS = {PNG: "Png", _JPEG: "Jpeg", b"RIFF": "WebP", b"BM": "Bmp", **dict.fromkeys(_TIFF, "Tiff")}
+_AVIF = b"ftyp"  # bytes 4 to 8, also of HEIC, which Pillow refuses
+_TIFF_MODES = frozenset(
+    {"1", "L", "LA", "P", "RGB", "RGBA", "RGBX", "YCbCr", "I;16", "I;16B"}
+)  # Pillow's, that are read
 _CHANNELS = 3  # bytes of a decoded photo's pixel
 # Limit of the bytes of a scene's decoded photos: a constant, plus a number of bytes for each byte of the photos' files.
 # A decoded pixel has 3 bytes, and even strongly compressed files have more than 3 / 100 bytes per pixel
@@ -233,7 +241,9 @@ def decode_image(path: Path, size: Size, divisor: int = 1) -> np.ndarray:
     pixels = _png_pixels(data) if data[: len(PNG)].tobytes() == PNG else data
     image = None
     with suppress(cv2.error):
-        if pixels is not None and len(pixels):
+        if data[:4].tobytes() in _TIFF or data[4:8].tobytes() == _AVIF:
+            image = _decode_by_pillow(path)
+        elif pixels is not None and len(pixels):
             image = cv2.imdecode(pixels, _REDUCTIONS[divisor] | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None:
         raise _undecodable(path, size)
@@ -297,9 +307,8 @@ def decode_levels(path: Path, photo: Path | None = None) -> np.ndarray:
     grey = _decode_brightness(path, _photo_budget(path, *([] if photo is None else [photo])))
     brightest = float(grey.max(initial=0))
     whites = 1, 255, 65535  # of fractions or of 0 and 1, of 8 bits, and of 16 bits
-    white = next(
-        (white for white in whites if brightest <= white), brightest
-    )  # other files are scaled to the brightest
+    # Other files are scaled to the brightest pixel
+    white = next((white for white in whites if brightest <= white), brightest)
     if grey.dtype == np.uint8 and white == 255:
         return grey
     levels = np.zeros(grey.shape, np.uint8)
@@ -310,10 +319,8 @@ def decode_levels(path: Path, photo: Path | None = None) -> np.ndarray:
 
 
 def _decode_brightness(path: Path, budget: ReadBudget) -> np.ndarray:
-    """Decode the brightness ``[h,w]`` that a file stores; in 8-bit images, brightness times opacity.
-
-    A function of its own, since Pillow's copy of the image has to be gone before its levels are computed.
-    """
+    """Decode the brightness ``[h,w]`` that a file stores; in 8-bit images, brightness times opacity."""
+    # A function of its own, since Pillow's copy of the image has to be gone before its levels are computed
     with _open_pixels(path) as image:
         _check_pillow_memory(budget, image)
         if image.mode[0] in "IF":  # more than 8 bits
@@ -328,16 +335,29 @@ def _decode_brightness(path: Path, budget: ReadBudget) -> np.ndarray:
         return grey
 
 
-def mark_drawn(data: bytes) -> bytes:
-    """Mark the bytes of a picture as a drawing of gsmerge, so that no search for photos takes it.
+def _decode_by_pillow(path: Path) -> np.ndarray:
+    """Decode a TIFF or an AVIF to ``[h,w,3]`` uint8 BGR, as OpenCV decodes others; Pillow turns a TIFF upright."""
+    with _open_pixels(path) as image:
+        if image.mode in ("I;16", "I;16B"):
+            levels = (np.asarray(image).astype(np.uint32) + 128) // 257  # of 255, rounded
+            return np.repeat(levels[..., None].astype(np.uint8), _CHANNELS, axis=2)
+        return np.ascontiguousarray(np.asarray(image.convert("RGB"))[..., ::-1])
 
-    Decoders of other formats than PNG ignore what follows the last pixel, so that their mark is there.
+
+def _tiff_size(path: Path, image: Image.Image) -> Size:
+    """Return the (width, height) of a TIFF when it is upright; SceneError if its pixels are of a kind that is not read.
+
+    Pillow shows some kinds of 16 bits wrong: planes one after another, and white as 0.
     """
-    if not data.startswith(PNG):
-        return data + DRAWN
-    chunk = b"tEXt" + DRAWN
-    text = struct.pack(">I", len(DRAWN)) + chunk + struct.pack(">I", zlib.crc32(chunk))
-    return data[:PNG_START] + text + data[PNG_START:]
+    width_tag, height_tag, bits_tag, white_tag, orientation_tag, planes_tag = 256, 257, 258, 262, 274, 284
+    tags: Any = image.tag_v2  # type: ignore[attr-defined]
+    bits = max(tags.get(bits_tag, (1,)))
+    is_odd = bits > 8 and (tags.get(planes_tag) == 2 or tags.get(white_tag) == 0)
+    if image.mode not in _TIFF_MODES or is_odd:
+        found = f"{bits} bits, {image.mode}" + (" in planes or with white as 0" if is_odd else "")
+        raise SceneError(path, f"expected a TIFF of 8 or 16 bits, grey or RGB, found {found}", CONVERT)
+    size = int(tags[width_tag]), int(tags[height_tag])
+    return size[::-1] if tags.get(orientation_tag, 1) > 4 else size
 
 
 def decode_alpha(path: Path) -> np.ndarray | None:
@@ -355,7 +375,8 @@ def decode_alpha(path: Path) -> np.ndarray | None:
 
 def _photo_budget(path: Path, *beside: Path) -> ReadBudget:
     """Return the budget of a photo or mask that is decoded alone, by its bytes and those of the files ``beside`` it."""
-    return ReadBudget(path, sum(map(check_file, (path, *beside))), _PHOTO_MEMORY_PER_BYTE, _SMALLER)
+    most = _AVIF_MEMORY_PER_BYTE if path.suffix.lower() == ".avif" else _PHOTO_MEMORY_PER_BYTE
+    return ReadBudget(path, sum(map(check_file, (path, *beside))), most, _SMALLER)
 
 
 def _check_pillow_memory(budget: ReadBudget, image: Image.Image) -> None:
@@ -371,6 +392,8 @@ def _decoder_bytes(image: Image.Image) -> float:
 
     A decoder of WebP needs this memory for frames, and a decoder of progressive JPEGs for coefficients.
     """
+    if image.format in ("TIFF", "AVIF"):
+        return _TIFF_OR_AVIF_BYTES
     if image.format == "WEBP":
         return _MOVING_WEBP_BYTES if getattr(image, "is_animated", False) else _WEBP_BYTES
     # A channel of a JPEG may have fewer samples than the image has pixels
@@ -404,11 +427,17 @@ def _undecodable(path: Path, size: Size = (0, 0)) -> SceneError:
     work_bytes = 9  # additional bytes of a pixel while a library decodes it
     np.empty((_CHANNELS + work_bytes, *size), np.uint8)  # raises MemoryError, since the library does not say so
     refuse_picture(path)
-    return SceneError(path, "expected an image, found a file that cannot be decoded", "replace it")
+    start = read_start(path, 8)
+    if start[4:] == _AVIF and not features.check("avif"):
+        return SceneError(
+            path, "expected an image, found AVIF, which this Pillow does not read", "update Pillow to 11.3"
+        )
+    remedy = CONVERT if start[:4] in _TIFF else "replace it"
+    return SceneError(path, "expected an image, found a file that cannot be decoded", remedy)
 
 
 def image_size(path: Path, *, limits_memory: bool = True) -> Size:
-    """Read (width, height) from the header of a PNG, JPEG, WebP, BMP or PNM file; the orientation tag is ignored.
+    """Read (width, height) from the header of an image file; the orientation tag is ignored, but of a TIFF.
 
     Raise SceneError if the file has another format or cannot be read, if the size is impossible, or if the file has far
     more bytes than its pixels need. With ``limits_memory``, also raise SceneError if the pixels take more memory than
@@ -426,7 +455,7 @@ def image_size(path: Path, *, limits_memory: bool = True) -> Size:
                 with quiet_warnings():
                     image = _open_image(file, _FORMATS)
                 work_bytes = _decoder_bytes(image)
-                width, height = image.size
+                width, height = _tiff_size(path, image) if image.format == "TIFF" else image.size
         except (SceneError, MemoryError):
             raise
         except Image.DecompressionBombError as error:
@@ -454,6 +483,8 @@ def orientation_turn(path: Path) -> int:
         try:
             with path.open("rb") as file, _open_image(file, (*_FORMATS, "PNG")) as image:
                 orientation_tag = 274  # number of the tag in EXIF
+                if image.format == "TIFF":
+                    return 0  # Pillow turns its pixels itself
                 return _TURNS.get(image.getexif().get(orientation_tag, 0), 0)
         except Exception:  # damage may make the library raise any error; pixels are checked later
             return 0
@@ -466,6 +497,7 @@ def _open_image(file: BinaryIO, formats: Sequence[str]) -> Image.Image:
     """
     start = file.read(max(map(len, _PLUGINS)))
     plugin = next((plugin for first, plugin in _PLUGINS.items() if start.startswith(first)), None)
+    plugin = "Avif" if start[4:8] == _AVIF else plugin
     if plugin is not None and plugin.upper() in formats:
         import_module(f"PIL.{plugin}ImagePlugin")
         formats = (plugin.upper(),)

@@ -164,6 +164,15 @@ def list_some(items: Sequence[str], separator: str = ", ") -> str:
     return separator.join(items[:max_named]) + rest
 
 
+def list_faults(faults: Sequence[str]) -> str:
+    """Join faults, each the name of a photo and a reason, to a text that says each reason once."""
+    reasons = dict[str, list[str]]()
+    for fault in faults:
+        photo, _, reason = fault.partition(": ")
+        reasons.setdefault(reason, []).append(photo)
+    return list_some([f"{list_some(names)}: {reason}" for reason, names in reasons.items()], "; ")
+
+
 def note(text: str) -> None:
     """Add a note or a :class:`Doubt` to the current record and to the package's log, unless it is in the record."""
     record = current_record()

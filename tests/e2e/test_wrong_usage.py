@@ -143,7 +143,7 @@ PLACES = {
     "./nowhere": "nowhere*no such file",
     "some/nowhere": "some/nowhere*no such file",
     "compact nowhere.ply -o q": "nowhere.ply",
-    "compact room --images heic -o a.ply": "heic*found 2 .heic*convert them",
+    "compact room --images heic -o a.ply": "heic*found 2 .heic*convert all*mogrify -format jpg heic/*.HEIC",
     "compact room --images heic/film.mov -o a.ply": "heic/film.mov*found a film*save the frames",
     "compact room alone.ply -o a.ply": "alone.ply*to join*no cameras*by itself",
     "compact room --images room/transforms.json": "room/transforms.json*folder of photos*file",

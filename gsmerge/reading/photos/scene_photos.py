@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from functools import partial
 from pathlib import Path, PurePath
 from typing import Any
@@ -23,7 +22,16 @@ from gsmerge.io.cameras.programs import SHARP
 from gsmerge.io.cameras.read_cameras import read_cameras
 from gsmerge.io.cameras.table import FFGS
 from gsmerge.io.first_bytes import CONVERT
-from gsmerge.io.image_names import IMAGE_SUFFIXES, find_image, is_drawn, list_images, natural_order, propose_images
+from gsmerge.io.image_names import (
+    IMAGE_SUFFIXES,
+    convert_all,
+    describe_missing_image,
+    find_image,
+    is_drawn,
+    list_images,
+    natural_order,
+    propose_images,
+)
 from gsmerge.io.photo_files import (
     ASPECT_TOLERANCE,
     PhotoArrays,
@@ -45,7 +53,7 @@ from gsmerge.method.raster.photos import row_pictures
 from gsmerge.reading.alignment import ESTIMATED
 from gsmerge.reading.photos.grid_fit import WHOLE_FIT, GridFit, PartFit, choose_fit, list_fits
 from gsmerge.reading.scene_files import SceneFiles, list_folders
-from gsmerge.runtime.record import list_some
+from gsmerge.runtime.record import list_faults, list_some
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Scene
 
@@ -163,7 +171,7 @@ def find_photos(files: SceneFiles, camera_file: CameraFile) -> ScenePhotos:
     if not pool:
         return NO_PHOTOS
     faults = tuple(
-        _describe_missing_file(folder, name) if exact and path is None else None
+        describe_missing_image(folder, name) if exact and path is None else None
         for name, path in zip(names, named, strict=True)
     )
     photos = ScenePhotos(
@@ -271,26 +279,12 @@ def count_pixels(path: Path) -> int:
     return 0 if isinstance(size, SceneError) else size[0] * size[1]
 
 
-def _describe_missing_file(folder: Path, name: str) -> str:
-    """Say that a file does not exist; also name a file of the same stem whose format is not read, if there is one."""
-    inner = PurePath(name)
-    same_stem = set[str]()
-    for place in {folder, folder if inner.is_absolute() or ".." in inner.parts else folder / inner.parent}:
-        with suppress(OSError, ValueError):
-            same_stem |= {file for file in os.listdir(place) if PurePath(file).stem == inner.stem}
-    unread = {file for file in same_stem if PurePath(file).suffix.lower() not in IMAGE_SUFFIXES}
-    short = inner.relative_to(folder.name) if inner.is_relative_to(folder.name) else inner  # without the folder's name
-    if not unread:
-        return f"{short}: no such file"
-    return f"{short}: no such file, and the format of {min(unread)} is not read; {CONVERT}"
-
-
 def _check_header(path: Path) -> str | None:
     """Return why the header of an image file cannot be read; None if it can be read."""
     size = attempt(image_size, path)
     if not isinstance(size, SceneError):
         return None
-    return f"{size.problem}; {CONVERT}" if size.remedy == CONVERT else size.problem
+    return f"{size.problem}; {convert_all(path)}" if size.remedy == CONVERT else size.problem
 
 
 def read_stored_photos(files: SceneFiles, camera_file: CameraFile) -> PhotoArrays:
@@ -532,17 +526,17 @@ def describe_assignment(photos: ScenePhotos, camera_file: CameraFile, *, are_pix
         text = f"{len(spare)} of {len(spare) + len(used)} photos {'has' if len(spare) == 1 else 'have'} no camera"
         names = list_some([_short_path(path, photos) for path in spare])
         notes.append(f"{text} and {'is' if len(spare) == 1 else 'are'} not used: {names}")
-    reasons = list[str]()
+    faults = list[str]()
     for view in photos.absent:
         path = photos.named[view]
         name = camera_file.names[view]
         shown = f"{name}: no photo shows this view"
         if path is not None:
             shown = f"{_short_path(path, photos)}: shows something else than its camera"
-        reasons.append(photos.faults[view] or shown)
-    if not reasons:
+        faults.append(photos.faults[view] or shown)
+    if not faults:
         return notes
-    return [*notes, Doubt(f"photos of {len(reasons)} of {count} views are left out: {list_some(reasons, '; ')}")]
+    return [*notes, Doubt(f"photos of {len(faults)} of {count} views are left out: {list_faults(faults)}")]
 
 
 def describe_missing(names: Sequence[str], stored: CameraFile | None, *, is_right: bool) -> str | None:
@@ -578,7 +572,7 @@ def explain_mismatch(photos: ScenePhotos, camera_file: CameraFile) -> MismatchEr
         shape = " (2 : 1 as 360-degree panoramas have)" if width == 2 * height else ""
         found = f"{width} x {height}{shape}, of which no part shows one of them"
     faults = [fault for fault in photos.faults if fault is not None]
-    reasons = f" ({list_some(faults, '; ')})" if faults else ""
+    reasons = f" ({list_faults(faults)})" if faults else ""
     problem = f"expected photos of {views}, found {found}{reasons}"
     return MismatchError(photos.folder, problem, "name their folder with --images")
 

@@ -8,12 +8,13 @@ import sys
 import weakref
 import zlib
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 from messages import refuses
-from PIL import Image
+from PIL import Image, features
 from sweeps import sweep
 from tiny_scene import Tiny, write_images
 
@@ -51,6 +52,63 @@ def test_names_are_matched_with_or_without_folder_or_extension(tmp_path: Path, t
     order = [2, 0, 1]
     images = read_images(tmp_path, [shorten(tiny.names[i]) for i in order])
     assert np.array_equal((images * 255).round(), tiny.images[order])
+
+
+def save_tiff(path: Path, pixels: np.ndarray, **options: Any) -> Path:
+    """Write a TIFF of 8 bits, or of 16 bits with the same levels."""
+    if pixels.dtype == np.uint8:
+        Image.fromarray(pixels).save(path, **options)
+    else:
+        assert cv2.imwrite(str(path), pixels[..., ::-1] if pixels.ndim == 3 else pixels)
+    return path
+
+
+@pytest.mark.parametrize("compression", [None, "tiff_lzw", "tiff_deflate"])
+@pytest.mark.parametrize("turn", [1, 3, 6])
+def test_a_tiff_is_read_upright(tmp_path: Path, compression: str | None, turn: int) -> None:
+    pixels = np.random.default_rng(0).integers(0, 256, (10, 14, 3), np.uint8)
+    path = save_tiff(tmp_path / "a.tif", pixels, compression=compression, tiffinfo={274: turn})
+    upright = np.rot90(pixels, {1: 0, 3: 2, 6: -1}[turn])
+    assert image_size(path) == upright.shape[1::-1]
+    assert np.array_equal(decode_image(path, image_size(path)), upright)
+    assert photos.orientation_turn(path) == 0
+
+
+def test_a_tiff_of_16_bits_has_the_levels_of_8(tmp_path: Path) -> None:
+    pixels = np.random.default_rng(0).integers(0, 256, (10, 14, 3), np.uint8)
+    for name, levels in (("rgb.tif", pixels), ("grey.tiff", pixels[..., 0])):
+        path = save_tiff(tmp_path / name, levels.astype(np.uint16) * 257)
+        expected = np.stack([levels] * 3, -1) if levels.ndim == 2 else levels
+        assert np.array_equal(decode_image(path, (14, 10)), expected)
+    assert np.array_equal(photos.decode_levels(tmp_path / "grey.tiff"), pixels[..., 0])  # as a mask
+
+
+def test_a_tiff_of_a_kind_that_is_not_read_is_refused(tmp_path: Path) -> None:
+    """Printers' colours, floats, planes of 16 bits, more than 4 GB, and half a file; each ends in one line."""
+    Image.new("CMYK", (14, 10)).save(tmp_path / "a.tif")
+    Image.new("F", (14, 10)).save(tmp_path / "b.tif")
+    whole = save_tiff(tmp_path / "c.tif", np.full((10, 14, 3), 1000, np.uint16)).read_bytes()
+    planes = struct.pack("<HHI", 284, 3, 1), struct.pack("<HHI", 284, 3, 1) + b"\2\0"
+    (tmp_path / "c.tif").write_bytes(whole.replace(planes[0] + b"\1\0", planes[1]))
+    (tmp_path / "d.tif").write_bytes(b"II+\0".ljust(600, b"\1"))
+    (tmp_path / "e.tif").write_bytes(whole[:200])
+    for name, found in (("a", "CMYK"), ("b", "32 bits"), ("c", "planes"), ("d", "BigTIFF"), ("e", "cannot be decoded")):
+        with refuses(SceneError, path := tmp_path / f"{name}.tif", found, "convert it to .jpg or .png"):
+            image_size(path)
+
+
+@pytest.mark.skipif(not features.check("avif"), reason="Pillow was built without libavif")
+def test_an_avif_is_read_and_its_turn_is_known(tmp_path: Path) -> None:
+    pixels = np.repeat(np.arange(0, 240, 15, dtype=np.uint8)[:, None, None], 24, 1).repeat(3, 2)
+    exif = Image.Exif()
+    exif[274] = 6
+    Image.fromarray(pixels).save(path := tmp_path / "a.avif", quality=95, exif=exif.tobytes())
+    assert image_size(path) == (24, 16)
+    assert photos.orientation_turn(path) == 3
+    assert np.abs(decode_image(path, (24, 16)).astype(int) - pixels).max() <= 3
+    path.write_bytes(path.read_bytes()[:-40])
+    with refuses(SceneError, path, "cannot be decoded"):
+        decode_image(path, image_size(path))
 
 
 def test_names_with_dots_are_matched(tmp_path: Path) -> None:

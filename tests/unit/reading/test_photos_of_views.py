@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from messages import names
-from PIL import Image
+from PIL import Image, features
 from plyfile import PlyData, PlyElement
 from shared import write_scene
 from sweeps import sweep
@@ -135,13 +135,13 @@ def test_a_photo_of_something_else_is_left_out_with_its_view_in_one_note(folder:
 def test_a_photo_with_the_ending_of_a_format_that_is_not_read_is_a_doubt(folder: Path) -> None:
     path = photos_in(folder)[1]
     path.rename(path.with_suffix(".HEIC"))
-    assert names(str(load_scene(folder).doubts), path.name, path.with_suffix(".HEIC").name, "convert")
+    assert names(str(load_scene(folder).doubts), path.name, ".HEIC is not read", f"{path.parent}/*.HEIC")
 
 
 @pytest.mark.parametrize(
     ("start", "name"),
     [
-        (b"\0\0\0\x20ftypavif", "AVIF"), (b"\0\0\0\x18ftypheic", "HEIC"), (b"v/1\x01\2\0\0\0", "OpenEXR"),
+        (b"II+\0\x08\0\0\0", "BigTIFF"), (b"\0\0\0\x18ftypheic", "HEIC"), (b"v/1\x01\2\0\0\0", "OpenEXR"),
         (b"\0\0\0\x0cJXL \r\n\x87\n", "JPEG XL"), (b"\0\0\0\x0cjP  \r\n\x87\n", "JPEG 2000"), (b"GIF89a", "GIF"),
         (b"#?RADIANCE\n", "Radiance"), (b"8BPS\0\1", "Photoshop"), (b"FUJIFILMCCD-RAW 0201", "raw"),
     ],
@@ -150,7 +150,31 @@ def test_a_photo_with_content_in_a_format_that_is_not_read_is_a_doubt(folder: Pa
     """Whatever its ending says; the note says how to go on."""
     path = photos_in(folder)[1]
     path.write_bytes(start.ljust(4096, b"\x80"))
-    assert names(str(load_scene(folder).doubts), path.name, name, "convert it to .jpg or .png")
+    assert names(str(load_scene(folder).doubts), path.name, name, f"{path.parent}/*.png")
+
+
+def test_photos_of_a_format_that_is_not_read_are_one_sentence(folder: Path) -> None:
+    for path in photos_in(folder):
+        path.write_bytes(b"\0\0\0\x18ftypheic".ljust(4096, b"\x80"))
+    (doubt,) = (text for text in load_scene(folder).doubts if "HEIC" in text)
+    assert (doubt.count("HEIC"), doubt.count("mogrify")) == (1, 1)
+
+
+@pytest.mark.parametrize("ending", ["tif", "avif"])
+def test_photos_in_tiff_and_avif_are_read(folder: Path, truth: np.ndarray, ending: str) -> None:
+    if ending == "avif" and not features.check("avif"):
+        pytest.skip("Pillow was built without libavif")
+    for path in photos_in(folder):
+        own = Image.fromarray((read(path) * 255).round().astype(np.uint8))
+        own.save(
+            path.with_suffix(f".{ending}"), **({"quality": 95, "subsampling": "4:4:4"} if ending == "avif" else {})
+        )
+        path.unlink()
+    cameras = folder / "transforms.json"
+    cameras.write_text(cameras.read_text().replace(".png", f".{ending}"))
+    loaded = load_scene(folder)
+    assert not loaded.doubts
+    assert right_ones(loaded, truth) == [True] * 4
 
 
 @pytest.mark.parametrize("sizes", ["apart", "of all"])

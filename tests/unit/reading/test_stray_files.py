@@ -187,7 +187,7 @@ def test_hints_on_pixels_for_rows_that_have_none_are_refused(
 
 
 @pytest.mark.parametrize(
-    ("place", "words"), [("walk.MP4", "a film"), ("images/a.heic", "1 .heic"), ("images/b.avif", "1 .avif")]
+    ("place", "words"), [("walk.MP4", "a film"), ("images/a.heic", "1 .heic"), ("images/b.jxl", "1 .jxl")]
 )
 def test_a_scene_without_photos_says_what_beside_it_is_not_read(tiny_folder: Path, place: str, words: str) -> None:
     shutil.rmtree(tiny_folder / "images")
