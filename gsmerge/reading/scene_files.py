@@ -57,6 +57,10 @@ _OTHER_PICTURES = {"masks", "targets"}  # folders of pictures that are no photos
 _POINT_CLOUDS = {"input.ply", "points3D.ply", "points.ply", "sparse_pc.ply"}  # names of point clouds of other programs
 _NUMBERED = re.compile(r"(.*?)[-_. ]?(\d+)\.ply")
 _STEPS = re.compile(r"(?:iteration|point_cloud)_(\d+)(?:\.ply|[\\/]point_cloud\.ply)$")
+_EXPORT = re.compile(r"(.*?)[-_. ]?(\d+)(\.[a-z.]+)", re.IGNORECASE)
+# Words before the number in names of steps of a training, and in names of files that are no steps
+_STEP_WORDS = {"export", "splat", "splats", "step", "iter", "iteration", "ckpt", "checkpoint", "cloud", "model"}
+_OTHER_WORDS = {"", "frame", "image", "img", "camera", "cam", "scene", "time", "moment"}
 # Ends of paths that a program gives to all its scenes, so that these ends do not name a scene
 _USUAL_END = re.compile(
     r"/(?:(?:exports/)?gs_ply/\d+|(?:point_cloud/iteration_\d+/)?point_cloud|ply/point_cloud_\d+|scene|gaussians)$"
@@ -86,6 +90,7 @@ class SceneFiles:
     more: tuple[SceneFiles, ...] = ()  # other scenes that show the same place, each in a frame of its own
     parts: tuple[Path, ...] = ()  # all files of a scene in several files, ``ply`` first; empty for a single file
     num_copies: int = 0  # number of other files in the folder with the same bytes as ``ply``
+    num_steps: int = 0  # number of earlier steps of the same training beside ``ply``
     named: frozenset[str] = frozenset()  # names of the fields that the caller set, so that they are not searched
     photo_option: str = "--images"  # option with which the user names the folder of ``images``
     # Photos, cameras and masks in the folder above the scene, if the scene lacks them: the option and the path of each.
@@ -147,6 +152,8 @@ class SceneFiles:
         notes = []
         if self.num_copies:
             notes.append(f"{self.num_copies + 1} files have the same bytes; {self.ply.name} is read")
+        elif self.num_steps:
+            notes.append(f"{self.ply.name} is the last of {self.num_steps + 1} steps of one training, and is read")
         elif self.parts:
             notes.append(f"{len(self.parts)} files are read as one scene: {self.ply.name} to {self.parts[-1].name}")
         if self.above:
@@ -214,10 +221,13 @@ def find_scene_files(
         return SceneFiles(path, camera_path or views_file, photos, mask_path, protect, named=named)
     plys = [path]
     num_copies = 0
+    num_steps = 0
     if os.path.isdir(path):
         plys = find_plys(path, camera_path)
         num_copies = len(list_plys(path)) - len(plys)
     ply = plys[0]
+    if path != ply or within is not None:
+        num_steps = [*_find_steps([*ply.parent.glob(f"[!.]*{ply.suffix}")]).values()].count(ply)
     for part in plys:
         check_file(part)
         if part.suffix.lower() in SEVERAL_USES:
@@ -243,8 +253,8 @@ def find_scene_files(
     parts = tuple(plys) if len(plys) > 1 else ()
     pictures = image_path, mask_path, protect
     files = SceneFiles(
-        ply, camera_path, *pictures, parts=parts, num_copies=num_copies, named=named, others=tuple(others),
-        below=below, root=roots[0],
+        ply, camera_path, *pictures, parts=parts, num_copies=num_copies, num_steps=num_steps, named=named,
+        others=tuple(others), below=below, root=roots[0],
     )  # fmt: skip
     return replace(files, above=_find_above(files, own_roots))
 
@@ -541,12 +551,39 @@ def named_ply(folder: Path) -> Path | None:
 def other_plys(folder: Path) -> list[Path]:
     """List the ``.ply`` files in a folder, not below it, that are neither results nor point clouds.
 
-    In a folder without such a ``.ply``, list the only file of another format if that file may have Gaussians.
+    In a folder without such a ``.ply``, list the only file of another format if that file may have Gaussians. Of the
+    steps of a training, only the last counts.
     """
     plys = natural_order(folder.glob("[!.]*.ply"))
     scenes = [*(path for path in plys[:_MAX_HEADERS] if _is_scene(path)), *plys[_MAX_HEADERS:]]
     packed = [] if scenes else [p for p in folder.glob("[!.]*") if p.suffix in _PACKED]
+    earlier = _find_steps(scenes or packed)
+    scenes, packed = ([path for path in paths if path not in earlier] for paths in (scenes, packed))
     return packed if len(packed) == 1 and may_hold_gaussians(packed[0]) else scenes
+
+
+def _find_steps(paths: Sequence[Path]) -> dict[Path, Path]:
+    """Map files of earlier steps of a training to the file of its last step; their names tell them from other numbers.
+
+    Trainers save at multiples of hundreds, or one less where steps count from 0, and at the end. Moments and parts have
+    numbers in a row. Without a word such as "export", several thousands have to agree.
+    """
+    groups = dict[tuple[str, str], dict[int, Path]]()  # name without the number, and ending -> number -> file
+    for path in paths:
+        match = _EXPORT.fullmatch(path.name)
+        if match is not None:
+            groups.setdefault((match[1], match[3]), {})[int(match[2])] = path
+    last_steps = dict[Path, Path]()
+    unit = 100  # steps
+    for (name, _), path_of in groups.items():
+        *early, last = sorted(path_of)
+        word = re.split(r"[-_. ]", name.lower())[-1]
+        is_training = word in _STEP_WORDS and (len(early) > 1 or last - sum(early) >= unit)
+        is_known = is_training or (word not in _PARTS | _OTHER_WORDS and last >= 10 * unit)
+        numbers = early if is_training else [*early, last]  # a training may end at any step
+        if early and is_known and {number % unit for number in numbers} in ({0}, {unit - 1}):
+            last_steps |= {path_of[number]: path_of[last] for number in early}
+    return last_steps
 
 
 def _is_scene(path: Path) -> bool:

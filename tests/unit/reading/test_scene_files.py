@@ -58,6 +58,41 @@ def test_last_step_of_a_trained_model_is_the_scene(tmp_path: Path, tiny: Tiny) -
     assert find_scene_files(actual.ply).cameras == tmp_path / "cameras.json"
 
 
+@pytest.mark.parametrize(
+    ("files", "scene"),
+    [
+        ("export_5000 export_10000 export_30000", "export_30000"), ("step-000009999 step-000029999", "step-000029999"),
+        ("iter_7000 iter_30000 room.compact", "iter_30000"), ("bicycle_7000 bicycle_30000", "bicycle_30000"),
+        ("ckpt_100 ckpt_200 ckpt_273", "ckpt_273"), ("ckpt_100 ckpt_500 ckpt_612", "ckpt_612"),
+        ("export_0 export_1 export_2", None), ("tile_100 tile_300", None), ("frame_1000 frame_2000", None),
+        ("splat_100 splat_101", None), ("0000 1000", None), ("room_100 room_200", None), ("export_100 room", None),
+        ("a_1000 b_2000", None), ("export_5000 export_10000 room", None),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("ending", [".ply", ".splat"])
+def test_last_of_several_exports_of_a_training_is_the_scene(
+    tmp_path: Path, files: str, scene: str | None, ending: str
+) -> None:
+    """Moments, parts and several scenes are none of a training."""
+    for name in files.split():
+        (tmp_path / f"{name}{ending}").write_bytes(b"\0" + name.encode())  # equal files would be copies
+    if scene is None or ("compact" in files and ending != ".ply"):
+        with pytest.raises(SceneError):
+            find_scene_files(tmp_path)
+        return
+    found = find_scene_files(tmp_path)
+    assert found.plys == (tmp_path / f"{scene}{ending}",)
+    count = sum("_" in name or "-" in name for name in files.split())
+    assert noted(found.notes, f"{scene}{ending}", f"{count} steps")
+
+
+def test_exports_of_a_training_are_not_joined_where_photos_are_as_many(tmp_path: Path, tiny: Tiny) -> None:
+    for step in (5000, 10000, 15000):
+        write_ply(tmp_path / f"export_{step}.ply", tiny.gaussians[: step // 30])
+    write_transforms(tmp_path / "transforms.json", tiny)
+    assert find_scene_files(tmp_path).plys == (tmp_path / "export_15000.ply",)
+
+
 def test_scene_of_a_folder_is_its_only_ply_or_that_of_a_usual_name(tmp_path: Path) -> None:
     make(tmp_path, "room.ply", "room.compact.ply", "points3D.ply", ".room-12.ply")
     assert find_scene_files(tmp_path).ply == tmp_path / "room.ply"
