@@ -20,6 +20,7 @@ import typer
 
 from gsmerge.errors import UsageError
 from gsmerge.frozen import dataclass
+from gsmerge.runtime.arguments import expand_home
 from gsmerge.runtime.plugins import LazyFunction
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.evaluate import NETS, EvaluateOptions
@@ -139,12 +140,12 @@ def usage_errors() -> Iterator[None]:
 
 def read_path(value: Any) -> Path | None:
     """Read the path of a parameter; a leading ~ is the home folder, also where the shell keeps it."""
-    return None if value is None else Path(value).expanduser()
+    return None if value is None else Path(expand_home(value))
 
 
 def read_paths(value: Any) -> list[Path]:
     """Read the paths of a parameter that takes several."""
-    return [Path(word).expanduser() for word in value or ()]
+    return [Path(expand_home(word)) for word in value or ()]
 
 
 def path_or_none(value: Any) -> Any:

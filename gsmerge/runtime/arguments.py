@@ -14,7 +14,10 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import fields
 from functools import cache, wraps
+from pathlib import Path
 from typing import Any, TypeVar, cast
+
+from gsmerge.errors import SceneError
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -46,21 +49,41 @@ def check_arguments(function: Function) -> Function:
     """Decorate a public function, so that arguments of other types than declared raise a TypeError of one line.
 
     A parameter is checked if its annotation consists of names from :data:`ARGUMENT_KINDS` and :data:`CLASSES`, or of
-    lists and mappings of these.
+    lists and mappings of these. Paths that begin with ~ are changed as by :func:`expand_home`.
     """
     signature = inspect.signature(function)
     checked = {name: str(p.annotation) for name, p in signature.parameters.items() if _is_known(str(p.annotation))}
 
     @wraps(function)
     def call(*args: Any, **named: Any) -> Any:
-        arguments = signature.bind(*args, **named).arguments
+        bound = signature.bind(*args, **named)
+        arguments = bound.arguments
         for name in [name for name in arguments if name in checked]:
             is_variadic = signature.parameters[name].kind is inspect.Parameter.VAR_POSITIONAL
-            for value in arguments[name] if is_variadic else [arguments[name]]:
+            values = arguments[name] if is_variadic else (arguments[name],)
+            for value in values:
                 _check_value(name, checked[name], value)
-        return function(*args, **named)
+            if "StrPath" in checked[name]:
+                paths = tuple(expand_home(value) if isinstance(value, str | os.PathLike) else value for value in values)
+                arguments[name] = paths if is_variadic else paths[0]
+        return function(*bound.args, **bound.kwargs)
 
     return cast("Function", call)
+
+
+def expand_home(path: Any) -> Any:
+    """Return a path whose leading ~ is replaced by the home folder, unless a file or folder has the name as it stands.
+
+    A name such as ~scan, which is no user's, stays as it is. Raise SceneError where no home folder is known.
+    """
+    text = os.fspath(path)
+    start = Path(text).parts[:1] if isinstance(text, str) and text.startswith("~") else ()
+    if not start or os.path.lexists(start[0]):
+        return path
+    expanded = os.path.expanduser(text)
+    if expanded == text and start == ("~",):
+        raise SceneError(text, "expected a home folder for ~, found none", "set HOME, or name the whole path")
+    return type(path)(expanded) if isinstance(path, Path) else expanded
 
 
 def check_fields(value: Any) -> None:

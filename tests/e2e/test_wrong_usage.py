@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shlex
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,10 @@ from bare_files import write_without_grid
 from PIL import Image
 from shared import write_small
 
+import gsmerge
 from gsmerge.cli import app, main
+from gsmerge.errors import SceneError
+from gsmerge.jobs.batch.find import find_scenes
 
 from .conftest import Run, assert_refused, listing
 
@@ -235,6 +239,30 @@ def test_tilde_is_the_home_folder_wherever_a_path_begins(
     for words in (("-o", "~/x.ply"), ("--output=~/x.ply",), ("-o~/x.ply",)):
         document = json.loads(run("compact", f"~/{smallest_copy.name}", *words, *quick, code=0).out)
         assert document["output"]["path"] == str(smallest_copy.parent / "x.ply")
+
+
+def test_a_name_that_begins_with_a_tilde_is_taken_as_it_stands(
+    smallest_copy: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As of copies that editors make; also for outputs, in lists, and in Python. No home folder is one line."""
+    monkeypatch.chdir(smallest_copy.parent)
+    scene = smallest_copy.rename("~scan").absolute()
+    quick = ("--dry-run", "--json", "--effort", "draft")
+    for words, output in (((), "~scan/scene.compact.ply"), (("-o", "~scan/x.ply"),) * 2, (("-o", "~x.ply"),) * 2):
+        path = json.loads(run("compact", "~scan", *words, *quick, code=0).out)["output"]["path"]
+        assert path == (output if isinstance(output, str) else output[1])
+    gaussians = gsmerge.read_gaussians(Path("~scan/scene.ply")).gaussians
+    gsmerge.write_gaussians("~scan/y.ply", gaussians)
+    assert (scene / "y.ply").is_file()
+    (scene / "list.txt").write_text("~copy.ply\n")
+    shutil.copy(scene / "scene.ply", scene / "~copy.ply")
+    assert list(find_scenes(["~scan/list.txt"], Path("out"))) == [Path("~scan/~copy.ply")]
+    monkeypatch.setattr("os.path.expanduser", lambda path: path)  # as where the user has no home folder
+    assert_refused(run("compact", "~/scan", "-o", "x.ply"), 3, "~/scan", "HOME")
+    assert_refused(run("compact", "~scan", "-o", "~/x.ply"), 3, "~/x.ply", "HOME")
+    assert_refused(run("compact", "~nobody"), 3, "~nobody", "no such file")
+    with pytest.raises(SceneError, match="~/scan"):
+        gsmerge.read_scene("~/scan")
 
 
 def test_help_as_a_word_prints_what_the_option_prints(run: Run) -> None:

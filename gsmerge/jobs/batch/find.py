@@ -20,6 +20,7 @@ from gsmerge.io.formats.table import STATE_ENDING, may_hold_gaussians
 from gsmerge.io.image_names import IMAGE_PLACES, natural_order
 from gsmerge.io.no_gaussians import find_remedy
 from gsmerge.reading.scene_files import PLY_PLACES, TRAINED_PLACES, list_plys, named_ply, other_plys
+from gsmerge.runtime.arguments import expand_home
 from gsmerge.runtime.record import list_some
 
 NamedScene = tuple[Path, Path | None]  # a scene, and the named folder in which it is; None if the user named the scene
@@ -251,7 +252,10 @@ def _read_list(file: Path, search: _Search) -> Iterator[NamedScene]:
             )
         entries[line.strip()] = None
         budget.check_memory(job_bytes * len(entries), count_words(len(entries), "scene"))
-    paths = [file.parent / os.path.expanduser(entry) for entry in entries if entry and not entry.startswith("#")]
+    named = [entry for entry in entries if entry and not entry.startswith("#")]
+    are_inside = [os.path.lexists(file.parent / entry) for entry in named]  # then ~ is a part of the name
+    places = (entry if inside else expand_home(entry) for entry, inside in zip(named, are_inside, strict=True))
+    paths = [file.parent / place for place in places]
     for path in sorted(paths, key=count_links):
         if not os.path.isdir(path):
             yield path, None
