@@ -56,6 +56,7 @@ PALETTE_BITS = 16  # bits of an index in the palette
 PALETTE_COLUMNS = 64  # entries of the palette that are side by side in its texture
 PACKED_BYTES = 19  # bytes of a Gaussian in the decoded textures
 CODES = 256  # number of values in a codebook
+_GSPLAT = "train with simple_trainer --save_ply, or write PngCompression().decompress(FOLDER) with gsplat.export_splats"
 _CELLS = 1 << 11  # number of cells of equal width, and of cells with equal counts of values, before any are merged
 
 
@@ -173,6 +174,10 @@ def _read_content(files: _Files, budget: ReadBudget) -> SogContent:
     """Read the ``meta.json`` of a ``.sog``, and the textures that it names."""
     meta = parse_json(files.read(META).decode("utf-8-sig"), budget)
     version = meta.get("version", 1) if isinstance(meta, dict) else "none"
+    means = meta.get("means") if version == 1 else None
+    if isinstance(means, dict) and "mins" in means and "files" not in means:
+        problem = f"expected .sog version {VERSION}, found a compressed checkpoint of gsplat (PngCompression)"
+        raise SceneError(budget.path, problem, _GSPLAT)
     if version != VERSION:
         problem = f"expected .sog version {VERSION}, found {version}"
         raise SceneError(budget.path, problem, f"export it as version {VERSION}")

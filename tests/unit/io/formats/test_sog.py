@@ -12,9 +12,11 @@ import cv2
 import numpy as np
 import pytest
 import scenes
+from messages import refuses
 from slow_readers import corners, drawn
 
 from gsmerge import Gaussians
+from gsmerge.errors import SceneError
 from gsmerge.io import read_gaussians, write_gaussians
 from gsmerge.io.formats.sog import fit_codebook, fit_palette, nearest_codes, sog_bytes
 from gsmerge.reading.scene_files import find_scene_files
@@ -60,6 +62,20 @@ def test_a_sog_that_was_unpacked_is_read(gaussians: Gaussians, tmp_path: Path) -
     assert actual.info.file_bytes == sum(path.stat().st_size for path in (tmp_path / "a").iterdir())
     assert find_scene_files(tmp_path / "a").ply == tmp_path / "a" / "meta.json"
     assert read_gaussians(tmp_path / "a").info == actual.info
+
+
+def test_a_compressed_checkpoint_of_gsplat_is_named(tmp_path: Path) -> None:
+    """Its PngCompression writes a meta.json without a version, as .sog version 1 has; that names its files."""
+    values = {"shape": [9, 3], "dtype": "float32", "mins": [0.0] * 3, "maxs": [1.0] * 3}
+    names = ("means", "scales", "quats", "opacities", "sh0", "shN")
+    meta = tmp_path / "meta.json"
+    meta.write_text(json.dumps(dict.fromkeys(names, values)))
+    for path in (tmp_path, meta):
+        with refuses(SceneError, meta, "gsplat", "PngCompression", "--save_ply"):
+            read_gaussians(path)
+    meta.write_text(json.dumps({name: values | {"files": [f"{name}.webp"]} for name in names}))
+    with refuses(SceneError, meta, "found 1"):
+        read_gaussians(meta)
 
 
 def test_a_codebook_is_nearly_the_best_one() -> None:
