@@ -19,6 +19,7 @@ from gsmerge.version import __version__
 if TYPE_CHECKING:
     from gsmerge import integrations as integrations
     from gsmerge.drawing.pages.view import view as view
+    from gsmerge.drawing.render_views import render as render
     from gsmerge.errors import DoubtWarning as DoubtWarning
     from gsmerge.errors import GsmergeError as GsmergeError
     from gsmerge.errors import SceneError as SceneError
@@ -33,7 +34,6 @@ if TYPE_CHECKING:
     from gsmerge.jobs.states.compactor import Compactor as Compactor
     from gsmerge.jobs.tensors import compact_tensors as compact_tensors
     from gsmerge.method.raster import Rendering as Rendering
-    from gsmerge.method.raster import render as render
     from gsmerge.method.stages.superpixels import saliency as saliency
     from gsmerge.method.stages.superpixels import superpixels as superpixels
     from gsmerge.reading.held_out import read_held_out as read_held_out
@@ -64,7 +64,8 @@ _PUBLIC = {
     "scoring.evaluate": ("Evaluation", "evaluate"),
     "drawing.pages.view": ("view",),
     "jobs.states.compactor": ("Compactor",),
-    "method.raster": ("Rendering", "render"),
+    "drawing.render_views": ("render",),
+    "method.raster": ("Rendering",),
     "reading.held_out": ("read_held_out",),
     "reading.read_scene": ("load_scene", "read_scene"),
     "settings.compact": ("CompactOptions",),

@@ -16,7 +16,7 @@ from gsmerge.io import atomic_output
 from gsmerge.io.image_names import mark_drawn
 from gsmerge.method.raster import render
 from gsmerge.method.raster.metrics import psnr, psnr_words
-from gsmerge.method.raster.photos import COVERED_TRANSMITTANCE, WHOLE_SHARE
+from gsmerge.method.raster.photos import COVERED_TRANSMITTANCE, NEAR_PLANE, WHOLE_SHARE
 from gsmerge.types import Cameras, Gaussians
 
 BytePicture = NDArray[np.uint8]  # [h,w,3], sRGB
@@ -107,6 +107,7 @@ def view_pictures(
     masks: Sequence[np.ndarray] | None = None,
     marks: Sequence[bool | None] | None = None,
     background: float | None = 0.0,
+    near: float = NEAR_PLANE,
 ) -> list[list[tuple[str, BytePicture]]]:
     """Render each scene in every view; return a row of pictures for each view, each with a line of text.
 
@@ -115,10 +116,10 @@ def view_pictures(
     number of Gaussians, and the PSNR against the photo or, if ``photos`` is None, against the render of the first
     scene. ``masks [h,w]`` say which pixels of the photos count; None: all. ``marks`` say which scenes are drawn
     antialiased; None: as the cameras say. If ``background`` is None, pictures lie on a chequered ground, and PSNR are
-    measured where the first scene shows something.
+    measured where the first scene shows something. ``near`` is the depth of the near plane.
     """
     drawn = [
-        render(gaussians, cameras, background or 0.0, antialiased=mark)
+        render(gaussians, cameras, background or 0.0, antialiased=mark, near=near)
         for (_, gaussians), mark in zip(scenes, marks or [None] * len(scenes), strict=True)
     ]
     renders = [one.images.clip(0, 1) for one in drawn]
@@ -154,17 +155,18 @@ def outside_pictures(
     photos: bool,
     marks: Sequence[bool | None] | None = None,
     background: float | None = 0.0,
+    near: float = NEAR_PLANE,
 ) -> list[tuple[str, BytePicture]]:
     """Render each scene from outside the capture; return a row of pictures, each with a line of text.
 
     The row fits below the rows of :func:`view_pictures`. If these rows begin with ``photos``, the row from outside
-    begins with a dark picture, because there is no photo from outside. ``marks`` and ``background`` are those of
-    :func:`view_pictures`.
+    begins with a dark picture, because there is no photo from outside. ``marks``, ``background`` and
+    ``near`` are those of :func:`view_pictures`.
     """
     camera, _ = outside_camera(cameras, scenes[0][1].means)
     renders = []
     for (name, gaussians), mark in zip(scenes, marks or [None] * len(scenes), strict=True):
-        drawn = render(gaussians, camera, background or 0.0, antialiased=mark)
+        drawn = render(gaussians, camera, background or 0.0, antialiased=mark, near=near)
         image = drawn.images[0]
         if background is None:
             image = lay_on_chequer(image, 1 - drawn.alphas[0, ..., 0])

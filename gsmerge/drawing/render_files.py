@@ -30,6 +30,7 @@ from gsmerge.drawing.preview import (
     to_picture,
     view_pictures,
 )
+from gsmerge.drawing.render_views import doubt_empty, near_plane
 from gsmerge.errors import SceneError, UsageError, name_notes
 from gsmerge.frozen import dataclass, replace
 from gsmerge.io import file_notes, read_cameras, read_gaussians, to_cameras
@@ -118,6 +119,7 @@ class DrawnScenes:
     infos: list[FileInfo]  # facts about their files
     notes: list[str]
     load: Loaded  # the scene whose frame and views are used
+    near: float  # near plane for the views, world units
 
     def counts(self) -> dict[str, int]:
         """Return the number of Gaussians of every scene by its path."""
@@ -128,7 +130,7 @@ class DrawnScenes:
         cameras: Cameras,
         options: DrawOptions,
         threads: int,
-        near: float = 0.01,
+        near: float,
         borders: Sequence[Sequence[int]] | None = None,
         *,
         transparent: bool = False,
@@ -159,6 +161,12 @@ class DrawnScenes:
             else:
                 yield pictures
 
+    def note_empty(self, cameras: Cameras, near: float, names: Sequence[str]) -> None:
+        """Note in which pictures of the cameras no Gaussian is seen, by the ``names`` of the pictures."""
+        for path, gaussians in self.scenes:
+            doubts = doubt_empty(gaussians, cameras, near, names)
+            self.notes.extend(doubts if len(self.scenes) == 1 else name_notes(path, doubts))
+
 
 def frame_files(files: SceneFiles, cameras: StrPath | None, images: StrPath | None) -> SceneFiles:
     """Find the files of the scene that defines the frame of the cameras.
@@ -186,6 +194,7 @@ def prepare_panel(options: DrawOptions) -> Drawing:
     panel_views = 4  # rows of a panel
     ids = options.choose(scene.names, panel_views)
     names = [re.split(r"[\\/]", scene.names[i])[-1] for i in ids]
+    group.note_empty(cameras[ids], group.near, names)
 
     def draw(_: int) -> Iterator[BytePicture]:
         """Yield the panel: rows of photos and renders, then a row from outside."""
@@ -200,12 +209,11 @@ def prepare_panel(options: DrawOptions) -> Drawing:
         if shown and not options.size:
             counts = scored_pictures(scene)[0].masks  # of an object before one colour, the object counts
             masks = None if counts is None else [counts[i] for i in ids]
-        rows = view_pictures(named, cameras[ids], shown, names, masks=masks, marks=marks, background=options.background)
+        looks: dict[str, Any] = {"marks": marks, "background": options.background, "near": group.near}
+        rows = view_pictures(named, cameras[ids], shown, names, masks=masks, **looks)
         # If the scene has no cameras, gsmerge placed the views, the first half around the scene, the others inside it
         outer_cameras = cameras if group.load.cameras is not None else cameras[: len(cameras) // 2]
-        outside = outside_pictures(
-            named, outer_cameras, photos=shown is not None, marks=marks, background=options.background
-        )
+        outside = outside_pictures(named, outer_cameras, photos=shown is not None, **looks)
         yield contact_sheet([*rows, outside])
 
     facts = {"scenes": group.counts(), "views": ids, "photos": len(pictured) > 0, "notes": group.notes}
@@ -218,12 +226,13 @@ def prepare_pictures(options: DrawOptions) -> Drawing:
     is_folder = options.output.suffix.lower() not in PICTURES
     ids = options.choose(group.load.scene.names) if is_folder or options.views else [0]
     views, stems = options.resize(group.load.scene.cameras[ids]), picture_stems(group.load.scene.names)
+    group.note_empty(views, group.near, [stems[i] for i in ids])
     names = [f"{path.name}: {len(gaussians):,}" for path, gaussians in group.scenes]
 
     def draw(threads: int) -> Iterator[BytePicture]:
         """Yield a picture for each camera. Several scenes are side by side, with their names."""
         transparent = len(group.scenes) == 1 and (is_folder or options.output.suffix.lower() in TRANSPARENT)
-        for pictures in group.draw(views, options, threads, transparent=transparent):
+        for pictures in group.draw(views, options, threads, group.near, transparent=transparent):
             yield contact_sheet([list(zip(names, pictures, strict=True))]) if len(pictures) > 1 else pictures[0]
 
     facts = {"width": views.width, "height": views.height, "scenes": group.counts(), "views": ids, "notes": group.notes}
@@ -234,6 +243,7 @@ def prepare_clip(options: DrawOptions) -> Drawing:
     """Prepare a clip along a path, with moving lines between the scenes. An output folder gets single frames."""
     group, cameras, near, ids = _make_path(options)
     cameras = options.resize(cameras)
+    group.note_empty(cameras, near, [f"frame {i}" for i in range(len(cameras))])
     paths = [path.absolute() for path, _ in group.scenes]
     repeats_names = len({path.name for path in paths}) < len(paths)
     texts = [
@@ -339,7 +349,9 @@ def _read_scenes(options: DrawOptions, *, photos: bool) -> DrawnScenes:
     notes = [[*([] if same_file else file_notes(first_ply.info)), *load.notes], *(file_notes(ply.info) for ply in plys)]
     notes_with_paths = [note for path, texts in zip(paths, notes, strict=True) for note in name_notes(path, texts)]
     infos = [file.info for file in (first_ply, *plys)]
-    return DrawnScenes(list(zip(paths, scenes, strict=True)), infos, notes_with_paths if plys else list(notes[0]), load)
+    near = near_plane(scenes[0], load.scene.cameras)
+    shown_notes = notes_with_paths if plys else list(notes[0])
+    return DrawnScenes(list(zip(paths, scenes, strict=True)), infos, shown_notes, load, near)
 
 
 def find_view(view: str, names: Sequence[str]) -> int:

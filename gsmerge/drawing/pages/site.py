@@ -10,6 +10,7 @@ from gsmerge.drawing.camera_path import median_camera
 from gsmerge.drawing.pages.data import encode_still
 from gsmerge.drawing.pages.page import VIEWER, base64_text, data_uri, describe_gain, page_camera, render_template
 from gsmerge.drawing.preview import to_picture
+from gsmerge.drawing.render_views import near_plane
 from gsmerge.io.atomic import AddOutput
 from gsmerge.io.formats.rows import read_expected_scores
 from gsmerge.io.formats.sog import sog_bytes
@@ -58,7 +59,8 @@ def make_page(gaussians: Gaussians, cameras: Cameras, title: str, comments: Sequ
     is_free = len(cameras) == 0
     viewpoints = place_viewpoints(gaussians.numpy()) if is_free else cameras.numpy()
     start = 0 if is_free else median_camera(viewpoints)  # the first of the placed viewpoints is outside the scene
-    poster = encode_still(to_picture(render(gaussians.numpy(), viewpoints[[start]]).images[0]))
+    near = near_plane(gaussians, viewpoints)
+    poster = encode_still(to_picture(render(gaussians.numpy(), viewpoints[[start]], near=near).images[0]))
     views = sorted({*even_views(len(viewpoints), min(len(viewpoints), MAX_VIEWPOINTS)), start})
     vendor = resources.files("gsmerge.drawing.pages").joinpath("vendor")
     texts = [f"{name}\n\n{vendor.joinpath(f'LICENSE.{name}').read_text('utf-8')}" for name in LICENSED]

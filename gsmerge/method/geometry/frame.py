@@ -69,10 +69,13 @@ def scene_frame(scene: Scene) -> Frame:
     if len(scene.gaussians) == 0 or len(scene) == 0:
         raise ValueError(f"expected Gaussians and views, got {len(scene.gaussians)} and {len(scene)}")
     means = scene.gaussians.means[sample_rows(scene)].astype(np.float64)
-    depth = scene_depth(scene)
+    return Frame(lower_median(means), unit_of(scene_depth(scene)))
+
+
+def unit_of(depth: float) -> float:
+    """Return the power of two that is nearest to a depth; 1 for a depth of 0, or one that is not finite."""
     mantissa, exponent = math.frexp(depth if depth > 0 and math.isfinite(depth) else 1.0)  # mantissa: 0.5 to 1
-    unit = math.ldexp(1.0, exponent if mantissa >= math.sqrt(0.5) else exponent - 1)
-    return Frame(lower_median(means), unit)
+    return math.ldexp(1.0, exponent if mantissa >= math.sqrt(0.5) else exponent - 1)
 
 
 def scene_depth(scene: Scene) -> float:
@@ -88,7 +91,12 @@ def scene_depth(scene: Scene) -> float:
             means = means[homes >= 0]
             homes = homes[homes >= 0]
         return float(lower_median(np.abs(camera_depths(means, scene.cameras.viewmats, homes // scene.pixels_per_view))))
-    views = scene.cameras[:: max(1, len(scene) // MAX_UNIT_VIEWS)]
+    return seen_depth(means, scene.cameras)
+
+
+def seen_depth(means: np.ndarray, cameras: Cameras) -> float:
+    """Measure the median depth of means ``[n,3]`` in all views that see them; 0 if no view sees one."""
+    views = cameras[:: max(1, len(cameras) // MAX_UNIT_VIEWS)]
     pixels, depths = project(means, views)
     x = pixels[..., 0]
     y = pixels[..., 1]

@@ -14,7 +14,6 @@ from gsmerge.method.kernels.raster.project import TILE
 from gsmerge.method.raster.composite import Rendering, background_color, blend, draw_views, prepare_views, view_colors
 from gsmerge.method.raster.photos import NEAR_PLANE
 from gsmerge.method.raster.tiled_view import FAR_PLANE, Splats, TiledView, make_splats, tile_view
-from gsmerge.runtime.arguments import check_arguments
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians, Scene
 
@@ -24,45 +23,19 @@ ONE_AT_A_TIME = 4_000_000
 BAND_PIXELS = 1 << 22  # largest number of pixels drawn at once; larger images are drawn in bands to save memory
 
 
-@check_arguments
 def render(
     gaussians: Gaussians,
     cameras: Cameras,
     background: float | Sequence[float] | Array = 0.0,
     *,
     antialiased: bool | None = None,
-    near: float = 0.01,
+    near: float = NEAR_PLANE,
     far: float = FAR_PLANE,
     with_depths: bool = False,
 ) -> Rendering:
-    """Render Gaussians into every camera.
+    """Render Gaussians into every camera; see :func:`gsmerge.drawing.render_views.render` for arguments and gradients.
 
-    Arrays give arrays, and tensors give tensors. Rendering runs on the CPU. Tensors on a GPU are copied to the CPU, and
-    results and gradients are copied back.
-
-    For tensors, images and alphas are differentiable with respect to the Gaussians and the view matrices. Depths and
-    intrinsics have no gradient. No gradient passes where alpha is clamped at 0.99 or a colour at 0.
-
-    Args:
-        gaussians: n Gaussians, SH degrees 0 to 4.
-        cameras: c cameras, whose skew is ignored.
-        background: Colour behind the Gaussians, 1 or 3 numbers.
-        antialiased: Lower the opacity of small Gaussians to compensate for the dilation; None: as ``cameras`` say,
-            which have the mark of a scene's file.
-        near: Nearest depth drawn, world units, above 0.
-        far: Farthest depth drawn.
-        with_depths: Also render the mean depth.
-
-    Returns:
-        Images, alphas and, if requested, depths.
-
-    Raises:
-        ValueError: If the background has another number of values, or if ``near`` is not above 0 and below ``far``.
-
-    Example:
-        >>> scene = gsmerge.read_scene("demo")
-        >>> gsmerge.render(scene.gaussians, scene.cameras, background=1.0).images.shape
-        (5, 32, 48, 3)
+    ``near`` and ``far`` are depths in the unit of the Gaussians, by default for the canonical frame.
     """
     background_rgb = background_color(background.detach().cpu() if hasattr(background, "detach") else background)
     options: dict[str, Any] = {"near": near, "far": far}
@@ -96,7 +69,7 @@ def render_in_batches(
     background: float | Sequence[float] | None = 0.0,
     *,
     at_once: int,
-    near: float = 0.01,
+    near: float = NEAR_PLANE,
     convert: Callable[[np.ndarray], np.ndarray] = np.asarray,
     columns: Sequence[tuple[int, int]] | None = None,
 ) -> Iterator[np.ndarray]:
