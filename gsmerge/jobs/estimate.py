@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -29,17 +30,14 @@ from gsmerge.prepare.prepare_scene import views_notes
 from gsmerge.prepare.repeats import without_repeats
 from gsmerge.reading.read_scene import Loaded
 from gsmerge.results.outputs import Outputs
-from gsmerge.run import compact_scene
 from gsmerge.runtime.documents import document_head, note_entries, note_lines
 from gsmerge.runtime.memory import human_bytes, memory_bytes, memory_problem
-from gsmerge.runtime.record import record_part, record_run
-from gsmerge.runtime.threads import available_threads, use_threads
+from gsmerge.runtime.record import record_run
+from gsmerge.runtime.threads import available_threads
 from gsmerge.scoring.coverage import shares_inside
 from gsmerge.settings.compact import OURS, CompactOptions
 from gsmerge.types import Scene
 
-# Most Gaussians of a scene without cameras for which the search is run; it takes seconds
-MAX_SEARCHED_GAUSSIANS = 500_000
 INSIDE_GAUSSIANS = 10_000  # sample of Gaussians for the share that lies inside a view
 BESIDE = ("cameras", "images", "masks", "protect")  # fields of SceneFiles that are read with the Gaussians
 # Costs of runs: means over whole runs with various settings. Estimates are right within a factor of about two
@@ -102,13 +100,14 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
 
     Returns:
         ``num_gaussians`` is the largest number of Gaussians that the result can have or, if ``exact``, the number that
-        it will have. If ``psnr_kept`` is a number, ``num_gaussians`` is the smallest number, and the run takes more
-        Gaussians until the PSNR against the input is ``psnr_kept`` dB. If ``loss_kept`` is a number, the run takes more
-        Gaussians until the result shows the photos at most ``loss_kept`` dB worse than the input. If ``quality`` is
-        given, the run takes more or fewer Gaussians until this quality is met. ``ratio`` is ``num_gaussians`` relative
-        to the input, and ``bytes`` is the size as a ``.ply``. ``superpixels_per_view`` is None if a budget distributes
-        superpixels among the views, and 0 if neighbouring Gaussians are merged instead of superpixels. ``blocks``,
-        ``method``, ``k``, ``match``, ``checkpoint``, ``fit`` and ``fit_steps`` are the values that the run would use.
+        it will have. If ``psnr_kept`` is a number, ``num_gaussians`` is the smallest number, and the run takes
+        more Gaussians, up to ``most_gaussians``, until the PSNR against the input is ``psnr_kept`` dB. If
+        ``loss_kept`` is a number, the run takes more Gaussians until the result shows the photos at most
+        ``loss_kept`` dB worse than the input. If ``quality`` is given, the run takes more or fewer Gaussians
+        until this quality is met. ``ratio`` is ``num_gaussians`` relative to the input, and ``bytes`` is the
+        size as a ``.ply``. ``superpixels_per_view`` is None if a budget distributes superpixels among the
+        views, and 0 if neighbouring Gaussians are merged instead of superpixels. ``blocks``, ``method``, ``k``,
+        ``match``, ``checkpoint``, ``fit`` and ``fit_steps`` are the values that the run would use.
         ``seconds`` and ``memory_bytes`` have two digits, and are right within a factor of about two. ``memory_problem``
         says that this machine has too little memory, or is None.
     """
@@ -124,13 +123,13 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
     max_count = num_pixels if options.method.startswith("unmerged") else limits.count or limits.default
     no_views = is_without_views(scene, options)
     has_target = plan.count.keeps_fidelity or options.budget.target_psnr is not None
-    found_count = None
-    if no_views and has_target and num_input <= MAX_SEARCHED_GAUSSIANS:  # estimates find it by the search of a run
-        with use_threads(options.threads), record_part(silent=True):
-            found_count = len(compact_scene(scene, options.with_settings({"levels": 1, "crop": None})).gaussians)
-    count = found_count or min(scene.num_gaussians or num_pixels, max_count)
+    count = min(scene.num_gaussians or num_pixels, max_count)
+    keeps_renders = plan.count.keeps_fidelity and size.rendered
+    # To search for the number would take as long as the run, so a plan knows its bounds alone; time is estimated for
+    # their geometric mean
+    most = limits.max_count if keeps_renders else count
     at_once, num_rest = gaussians_at_once(num_pixels, num_blocks), 3 * scene.gaussians.shN.shape[1]
-    num_drawn = num_pixels if options.method == "unmerged-fit" else count
+    num_drawn = num_pixels if options.method == "unmerged-fit" else round(math.sqrt(count * most))
     fit = {OURS: plan.fit.fit, "unmerged-fit": "full"}.get(options.method, "none")
     steps = 0 if fit == "none" else plan.fit.steps
     all_pixels, budget = at_once * num_blocks, options.budget  # a view that is in two blocks is built twice
@@ -152,9 +151,10 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
         per_view = 0
     return {
         "num_gaussians": count,
-        "exact": options.budget.is_filled or found_count is not None,
-        "psnr_kept": FIDELITY_PSNR if plan.count.keeps_fidelity and size.rendered and found_count is None else None,
-        "quality": options.budget.quality if found_count is None else None,
+        "exact": options.budget.is_filled,
+        "most_gaussians": most,
+        "psnr_kept": FIDELITY_PSNR if keeps_renders else None,
+        "quality": options.budget.quality,
         "loss_kept": FIDELITY_LOSS if plan.count.keeps_fidelity and not size.rendered else None,
         "ratio": count / max(1, num_input),
         "bytes": file_bytes(count, scene.gaussians.sh_degree),
@@ -182,7 +182,8 @@ def estimate_lines(run: Mapping[str, Any]) -> list[str]:
     count = f"{run['num_gaussians']:,} Gaussians ({100 * run['ratio']:.1f} %)"
     number = count if run["exact"] else f"at most {count}"
     if run["psnr_kept"] is not None:
-        number = f"{count}, or more until the PSNR against the input is {run['psnr_kept']:g} dB"
+        bound = f"at most {run['most_gaussians']:,} Gaussians; the run chooses the number"
+        number = f"{bound}: {count}, or more until the PSNR against the input is {run['psnr_kept']:g} dB"
     if run["quality"] is not None:
         number = f"{count}, or more or fewer until --quality {run['quality']} is met"
     if run["loss_kept"] is not None:

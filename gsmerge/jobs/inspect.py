@@ -173,11 +173,11 @@ def _describe_scene(load: Loaded, *, is_result: bool) -> dict[str, Any]:
     # A run takes these steps, too, with these sizes and these notes on sizes and photos
     canonical = distinct
     changes: tuple[str, ...] = ()
-    names = ("finite", "views", "frame", "sizes")
+    names = ("finite", "frame", "sizes", "pixels", *RULES, "background", "photos")
     with record_part(silent=True) as record:
         if len(distinct.gaussians) > 0:
-            steps = select(*names, "pixels", *RULES, "background", "photos") if len(distinct) else select(*names)
-            prepared = take_steps(steps, begin(distinct))
+            # Placing cameras in a scene without any would take as long as the run needs for them
+            prepared = take_steps(select(*names) if len(distinct) else select("finite"), begin(distinct))
             canonical = prepared.scene
             changes = prepared.changes
     agreement = confirm_depths(canonical)

@@ -9,7 +9,7 @@ from gsmerge.runtime.record import RunPart
 
 # Number of candidates that a search usually builds: first, if photos score them; second, if renders of the input do
 USUAL_BUILDS = 3
-USUAL_BUILDS_OF_RENDERS = 1
+USUAL_BUILDS_OF_RENDERS = 2
 # Work of the stages of a build, and of scoring the input, for each view, in steps of a fit
 STAGE_STEPS = 10.0
 INPUT_STEPS = 3.0
