@@ -92,8 +92,8 @@ def compact(
     if features is not None and len(scenes) > 1:
         raise UsageError(f"{features}: expected Feature Gaussians as the only input, got {len(scenes)} inputs")
     source = features or _find_files(scenes, output, cameras, images=images, masks=masks, protect=protect)
-    ply = source if isinstance(source, Path) else source.base
-    out = output_file(output or ply.parent, f"{ply.stem}.compact.ply")
+    base = source if isinstance(source, Path) else source.base
+    out = output_file(output or base.parent, f"{base.stem}.compact.ply")
     run = Run(
         scenes[0], out=out, start=start, overwrite=overwrite, dry_run=dry_run, strict=strict, json=json,
         verbose=verbose, quiet=quiet, has_page=open is not None,

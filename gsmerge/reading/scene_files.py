@@ -99,6 +99,7 @@ class SceneFiles:
     others: tuple[Path, ...] = ()  # further camera files, tried in turn if ``cameras`` do not fit
     below: bool = False  # True: ``others`` are in folders below, and are read only if photos show that they fit
     root: Path | None = None  # the scene's own folder
+    folder: Path | None = None  # the folder that the user named; None: a file
 
     @property
     def plys(self) -> tuple[Path, ...]:
@@ -143,7 +144,13 @@ class SceneFiles:
 
     @property
     def base(self) -> Path:
-        """Path that names results: the scene's file, or ``scene.ply`` beside it if the scene has several files."""
+        """Path that names results.
+
+        It is the scene's file, or ``scene.ply`` beside it if the scene has several files. If the file lies below a
+        folder that the user named, it is a file in that folder, with the folder's name.
+        """
+        if self.folder is not None and self.folder != self.ply.parent:
+            return self.folder / f"{Path(os.path.abspath(self.folder)).name}.ply"
         return self.ply.with_name("scene.ply") if self.parts else self.ply
 
     @property
@@ -254,7 +261,7 @@ def find_scene_files(
     pictures = image_path, mask_path, protect
     files = SceneFiles(
         ply, camera_path, *pictures, parts=parts, num_copies=num_copies, num_steps=num_steps, named=named,
-        others=tuple(others), below=below, root=roots[0],
+        others=tuple(others), below=below, root=roots[0], folder=None if ply == path else path,
     )  # fmt: skip
     return replace(files, above=_find_above(files, own_roots))
 

@@ -62,6 +62,22 @@ def test_results_of_commands_say_in_their_headers_what_they_are(folder: Path, tm
     assert find_scene_files(folder).ply == folder / "room.ply"
 
 
+@pytest.mark.parametrize("place", ["gs_ply/0000.ply", "point_cloud/iteration_7/point_cloud.ply"])
+def test_a_result_of_a_scene_deeper_in_a_folder_is_named_after_the_folder(
+    folder: Path, place: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ply = folder / place
+    ply.parent.mkdir(parents=True)
+    assert find_scene_files(folder).base == folder / "room.ply"  # beside the file
+    shutil.move(folder / "room.ply", ply)
+    assert find_scene_files(folder).base == folder / "scene.ply"  # the folder is called scene
+    assert find_scene_files(ply).base == ply
+    compact_files(find_scene_files(folder), PLAIN, Outputs(folder / "scene.compact.ply"))
+    assert find_scene_files(folder).ply == ply  # a result at the top does not hide the scene
+    monkeypatch.chdir(folder)
+    assert find_scene_files(".").base == Path("scene.ply")
+
+
 @pytest.mark.parametrize("name", ["x.ply", "scene.ply", "gaussians.ply", "gs_ply/0000.ply", "room2.ply"])
 def test_a_result_beside_the_scene_is_not_taken(folder: Path, tiny: Tiny, name: str) -> None:
     save_result(folder / name, tiny)
