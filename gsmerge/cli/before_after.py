@@ -138,7 +138,8 @@ def require_views(load: Loaded) -> None:
     """Raise SceneError if a scene has no views."""
     if len(load.scene) == 0:
         problem = "expected cameras to measure from, found none beside the scene"
-        raise SceneError(load.files.ply, problem, "name them with --cameras")
+        remedy = "name them with --cameras, or leave out --targets and --views: views are placed then"
+        raise SceneError(load.files.ply, problem, remedy)
 
 
 def held_out_views(

@@ -14,8 +14,19 @@ if TYPE_CHECKING:
 
 
 def output_file(output: Path, name: str) -> Path:
-    """Return the file to write: ``output`` itself or, if it is a folder that exists, the file ``name`` in it."""
-    return output / name if output.is_dir() else output
+    """Return the file to write: ``output`` itself or, if it is a folder that exists, the file ``name`` in it.
+
+    Raises UsageError if ``output`` is a format without a name.
+    """
+    from gsmerge.io.formats.table import OUTPUT_FORMATS
+
+    if output.is_dir():
+        return output / name
+    ending = f".{output}".lower()
+    if ending in (*OUTPUT_FORMATS, ".html") and not output.exists():
+        stem = name.partition(".")[0]
+        raise UsageError(f"{output}: expected a file to write, found a format; name it as in -o {stem}{ending}")
+    return output
 
 
 def check_outputs(

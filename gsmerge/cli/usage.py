@@ -17,7 +17,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from gsmerge.errors import UsageError
 from gsmerge.settings.reading import FileHints
-from gsmerge.settings.setting import flat_settings
+from gsmerge.settings.setting import flat_settings, suggest_name
 
 PROGRAM = "gsmerge"
 LAB = "lab"  # group of research commands
@@ -28,6 +28,15 @@ SYNONYMS = {
     **dict.fromkeys(("format", "to", "type"), "output"),
     **dict.fromkeys(("photos", "image-dir"), "images"),
     **dict.fromkeys(("poses", "colmap"), "cameras"),
+}
+# Words that users try as commands, and the commands that do this
+COMMAND_SYNONYMS = {
+    **dict.fromkeys(("compress", "reduce", "simplify", "optimize", "prune", "merge", "shrink"), "compact"),
+    **dict.fromkeys(("info", "stats", "check"), "inspect"),
+    **dict.fromkeys(("show", "open", "preview"), "view"),
+    **dict.fromkeys(("measure", "compare", "score", "metrics"), "evaluate"),
+    "draw": "render",
+    "export": "convert",
 }
 # Typer does not export the base of its usage errors, but exports BadParameter, which derives from it
 UsageErrors: Any = typer.BadParameter.__mro__[2]
@@ -57,6 +66,20 @@ class Group(TyperGroup):
         """Parse the words before the name of a subcommand."""
         adapt_to_texts(self.get_params(ctx))
         return super().parse_args(ctx, args)
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Find the subcommand; UsageError for an unknown one, with what may have been meant."""
+        name = args[0]
+        if self.get_command(ctx, name) is not None or name.startswith("-"):
+            return super().resolve_command(ctx, args)
+        from gsmerge.io.bounds import suggest_path
+
+        names = self.list_commands(ctx)
+        synonym = COMMAND_SYNONYMS.get(name.lower())
+        hint = f"; perhaps {synonym}" if synonym in names else suggest_name(name, names)
+        if not hint and ctx.parent is None:
+            hint = f"; to compact a scene, name a file or folder that exists{suggest_path(name)}"
+        raise UsageError(f"No such command '{name}'{hint}; see '{ctx.command_path} --help'")
 
 
 class Command(TyperCommand):

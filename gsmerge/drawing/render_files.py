@@ -54,6 +54,7 @@ from gsmerge.runtime.threads import use_threads
 from gsmerge.scoring.sizes import fill_cameras, fill_photo, shrink_cameras
 from gsmerge.settings.files import CLIPS, GIF, PICTURES, TRANSPARENT
 from gsmerge.settings.reading import OpacityChoice
+from gsmerge.settings.setting import suggest_name
 from gsmerge.types import Cameras, Gaussians, StrPath
 
 SECONDS = 4  # least duration of a clip
@@ -365,6 +366,7 @@ def find_view(view: str, names: Sequence[str]) -> int:
     ids = ids or [i for i, stem in enumerate(stems) if stem.lstrip("0") == number]
     if len(ids) != 1:
         problem = f"{len(ids)} views of this name" if ids else "no view of this name"
+        problem += suggest_name(view, [*stems, *names])
         raise UsageError(f"--views {view}: expected a number or a name of a view such as {stems[0]}, found {problem}")
     return ids[0]
 

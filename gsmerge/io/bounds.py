@@ -13,13 +13,14 @@ import re
 import stat
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TextIO
 
 from gsmerge.errors import OUT_OF_MEMORY, SceneError
 from gsmerge.frozen import dataclass
 from gsmerge.io.first_bytes import check_first_bytes
+from gsmerge.settings.setting import suggest_name
 from gsmerge.types import StrPath
 
 MAX_TEXT_BYTES = 32 << 20  # most bytes of a camera file; real files have far fewer
@@ -28,7 +29,7 @@ MAX_VIEWS = 10_000  # most views of a camera file
 MAX_FILES = 100_000  # most files and folders below a folder of photos
 MAX_PIXELS = 1 << 26  # most pixels of an image
 
-_ADDRESS = re.compile(r"(https?|s3|gs|ftp|file):/")  # start of a URL
+_ADDRESS = re.compile(r"(https?|s3|gs|ftp|file):/+")  # start of a URL
 # bytes of memory for any file, and for each byte of it
 _FREE_MEMORY = 64_000_000
 _MEMORY_PER_BYTE = 20
@@ -103,18 +104,32 @@ def check_file(path: Path) -> int:
     """Return the size of a file in bytes; raise SceneError if the file is missing, or of a kind that is not read."""
     try:
         status = os.stat(path)
+    except FileNotFoundError as error:
+        raise no_such_path(path, "no such file") from error
     except (OSError, ValueError) as error:
-        if _ADDRESS.match(str(path)):
-            raise SceneError(path, "expected a path, found a URL", "download the file and name its path") from error
-        missing = isinstance(error, FileNotFoundError)
-        problem = "no such file" if missing else f"cannot be read ({getattr(error, 'strerror', error)})"
-        raise SceneError(path, problem) from error
+        raise SceneError(path, f"cannot be read ({getattr(error, 'strerror', error)})") from error
     if stat.S_ISDIR(status.st_mode):
         raise SceneError(path, "expected a file, found a folder", "name a file in it")
     if not stat.S_ISREG(status.st_mode):
         raise SceneError(path, "expected a file, found a pipe or a device", "write its content to a file first")
     check_first_bytes(Path(path), status.st_size)
     return status.st_size
+
+
+def no_such_path(path: StrPath, problem: str = "no such file or folder") -> SceneError:
+    """Return the error for a path that does not exist, with what may have been meant."""
+    if _ADDRESS.match(str(path)):  # a Path has lost a slash
+        address = _ADDRESS.sub(r"\1://", str(path))
+        return SceneError(address, "expected a path, found a URL", "download the file and name its path")
+    return SceneError(path, problem, suggest_path(path).removeprefix("; "))
+
+
+def suggest_path(path: StrPath) -> str:
+    """Return the end of a message about a missing path: "; perhaps NAME", or nothing if no name beside it is alike."""
+    folder, name = os.path.split(os.path.normpath(path))
+    with suppress(OSError):
+        return suggest_name(name, os.listdir(folder or "."))
+    return ""
 
 
 def walk_files(folder: Path) -> list[Path]:

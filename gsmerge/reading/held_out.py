@@ -6,8 +6,9 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from gsmerge.errors import SceneError
+from gsmerge.errors import SceneError, attempt
 from gsmerge.frozen import dataclass, replace
+from gsmerge.io.bounds import no_such_path
 from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, select_views, to_cameras, with_convention
 from gsmerge.io.cameras.read_cameras import read_cameras
 from gsmerge.io.cameras.table import IN_SPLAT_FRAME
@@ -22,6 +23,9 @@ from gsmerge.reading.read_scene import Loaded
 from gsmerge.reading.scene_files import SceneFiles
 from gsmerge.types import Scene, StrPath, Views
 
+_NO_TARGETS = (
+    "targets are photos with their cameras; without targets, the scene's own views or placed ones are measured"
+)
 _OPTION = "evaluate --target-images"  # `gsmerge view` does not have this option
 
 
@@ -64,8 +68,11 @@ def read_held_out(load: Loaded, cameras: StrPath, images: StrPath | None = None)
     """
     path = Path(cameras)
     if not path.exists():
-        raise SceneError(path, "expected cameras of held-out views, found no such file or folder")
-    camera_file, shared = read_into_frame(load, path)
+        raise no_such_path(path, "expected cameras of held-out views, found no such file or folder")
+    read = attempt(read_into_frame, load, path)
+    if isinstance(read, SceneError):
+        raise SceneError(read.path, read.problem, read.remedy or _NO_TARGETS)
+    camera_file, shared = read
     shared |= _match_by_pose(camera_file.viewmats, load.scene)
     places = [i for i in range(len(camera_file)) if i not in shared]
     if not places:

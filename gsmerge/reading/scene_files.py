@@ -13,7 +13,7 @@ from pathlib import Path
 
 from gsmerge.errors import SceneError, attempt
 from gsmerge.frozen import dataclass, replace
-from gsmerge.io.bounds import check_file
+from gsmerge.io.bounds import check_file, no_such_path
 from gsmerge.io.cameras.foreign import check_program, find_unread
 from gsmerge.io.cameras.read_cameras import (
     count_images,
@@ -409,7 +409,7 @@ def named_path(path: StrPath | None) -> Path | None:
     if path is None or path == NONE:
         return None
     if not os.path.exists(path):
-        raise SceneError(path, "no such file or folder")
+        raise no_such_path(path)
     if not os.path.isdir(path):
         check_program(Path(path))
         check_file(Path(path))

@@ -121,7 +121,10 @@ def parse_quality(text: str) -> float:
     value = float(match[2]) if match else math.inf
     grey_psnr = 6.0  # PSNR (dB) that a grey picture reaches on any photo, so a smaller target is a mistake
     if match is None or not math.isfinite(value) or (value < grey_psnr and not match[1]):
-        hint = f'; perhaps "{text}dB"' if re.fullmatch(r"-?\d*\.?\d+", str(text), re.ASCII) else ""
+        number = float(text) if re.fullmatch(r"-?\d*\.?\d+", str(text), re.ASCII) else math.inf
+        usual = 50  # dB; hardly any result reaches more
+        hint = f'; perhaps "{text}dB"' if number <= usual else ""
+        hint = f"; a PSNR is usually 20 to 40 dB, and none reaches {text}" if usual < number < math.inf else hint
         hint = f'; perhaps "-{value:g}dB"' if match is not None and 0 < value < grey_psnr else hint
         raise ValueError(f'quality: expected a PSNR as "30dB" or a loss as "-0.2dB", got {text!r}{hint}')
     return -value if match[1] else value

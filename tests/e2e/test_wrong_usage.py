@@ -85,7 +85,12 @@ USAGE = {
     "compact room --budget 0.02": "--budget*'0.02'*\"2%\"",
     "compact room --ratio 0.1": "*--ratio*--budget",
     "room room": "room*twice*-o",
-    "compacc room": "*'compacc'*'compact'",
+    "compacc room": "*'compacc'*perhaps compact",
+    "compress room": "*'compress'*perhaps compact",
+    "roum": "*'roum'*name a file or folder that exists*perhaps room",
+    "convert alone.ply spz": "spz*format*-o alone.spz",
+    "compact room -o SOG": "SOG*format*-o scene.sog",
+    "compact room --quality 90": "--quality*'90'*usually 20 to 40 dB",
     "batch room -o out --set fit=none --quality 30": "--quality*'30'",
     "batch room -o out --jobs many": "--jobs*auto*'many'",
     "batch room -o room": "room*results",
@@ -144,6 +149,8 @@ USAGE = {
 }
 PLACES = {
     "nowhere.ply": "nowhere.ply*no such file",
+    "compact https://example.org/a.ply": "https://example.org/a.ply*URL*download",
+    "compact room --cameras room/transform.json": "room/transform.json*no such*perhaps transforms.json",
     "./nowhere": "nowhere*no such file",
     "some/nowhere": "some/nowhere*no such file",
     "compact nowhere.ply -o q": "nowhere.ply",

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from gsmerge.errors import SceneError
-from gsmerge.io.bounds import check_file
+from gsmerge.io.bounds import check_file, no_such_path
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.cameras.camera_source import CameraSource, check_objects
 from gsmerge.io.cameras.foreign import BESIDE_POSES, CAMERA_PLACES, check_program
@@ -118,7 +118,7 @@ def read_cameras(path: StrPath, *, folder: Path | None = None) -> CameraFile:
     """
     path = Path(path)
     if not os.path.exists(path):
-        raise SceneError(path, "no such file or folder")
+        raise no_such_path(path)
     if path.is_dir() and not _is_camera_folder(path):
         camera_path = find_cameras(path) or find_other_cameras(path)
         if camera_path is None:

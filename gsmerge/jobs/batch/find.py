@@ -13,7 +13,7 @@ from zipfile import BadZipFile
 from gsmerge.errors import SceneError, UsageError, count_words
 from gsmerge.io import SCENE_SUFFIXES
 from gsmerge.io.archives import open_archive
-from gsmerge.io.bounds import read_budget, read_lines
+from gsmerge.io.bounds import read_budget, read_lines, suggest_path
 from gsmerge.io.cameras.foreign import CAMERA_PLACES
 from gsmerge.io.formats.ply import header_content
 from gsmerge.io.formats.table import STATE_ENDING, may_hold_gaussians
@@ -111,7 +111,8 @@ def find_named_scenes(arguments: Sequence[str], out: Path, lookalikes: list[str]
         elif path.is_file():
             yield from _require_some(_read_list(path, search), argument, "in the list")
         else:
-            raise SceneError(path, "no such file or folder", "name a folder, a pattern, a .ply, or a list of them")
+            remedy = f"name a folder, a pattern, a .ply, or a list of them{suggest_path(path)}"
+            raise SceneError(path, "no such file or folder", remedy)
 
 
 def _require_some(scenes: Iterator[NamedScene], argument: str, where: str) -> Iterator[NamedScene]:

@@ -25,6 +25,11 @@ def test_a_view_of_an_unknown_name_is_refused(view: str) -> None:
         find_view(view, NAMES)
 
 
+def test_a_view_of_a_similar_name_is_suggested() -> None:
+    with refuses(UsageError, "--views images/00005.jpq", "no view of this name", "perhaps images/00005.jpg"):
+        find_view("images/00005.jpq", NAMES[:1])
+
+
 def test_a_name_of_two_views_is_refused() -> None:
     with refuses(UsageError, "--views 6.jpg", "2 views of this name"):
         find_view("6.jpg", ["a/06.jpg", "b/006.jpg"])
