@@ -73,6 +73,13 @@ _PUBLIC = {
     "method.stages.superpixels": ("saliency", "superpixels"),
     "types": ("Cameras", "Gaussians", "Scene", "Views"),
 }
+_HINTS = {
+    "load": "read_scene or read_gaussians",
+    "read": "read_scene or read_gaussians",
+    "open": "read_scene or read_gaussians",
+    "convert": "read_gaussians and write_gaussians",
+    "save": "the .save(path) of a result, or write_gaussians",
+}
 _EXPORTS = {name: home for home, names in _PUBLIC.items() for name in names}
 
 __all__ = ["__version__", *sorted(_EXPORTS)]  # noqa: PLE0604 - strings all, from the table above
@@ -83,7 +90,8 @@ def __getattr__(name: str) -> Any:
     if name == "integrations":
         return import_module(f"{__name__}.{name}")
     if name not in _EXPORTS:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        hint = f"; use {_HINTS[name]}" if name in _HINTS else ""
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}{hint}")
     value = getattr(import_module(f"{__name__}.{_EXPORTS[name]}"), name)
     globals()[name] = value
     return value

@@ -53,7 +53,7 @@ from gsmerge.runtime.record import Progress, begin_part, expect_parts, note, rec
 from gsmerge.runtime.threads import use_threads
 from gsmerge.settings.compact import OURS, CompactOptions
 from gsmerge.settings.reading import OpacityChoice
-from gsmerge.types import Scene, StrPath
+from gsmerge.types import Gaussians, Scene, StrPath
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -71,14 +71,14 @@ SIMPLER: Sequence[tuple[str, Callable[[CompactOptions], CompactOptions]]] = (
 
 @check_arguments
 def compact(
-    scene: Scene | StrPath, options: CompactOptions | None = None, *, progress: Progress | None = None,
+    scene: Scene | Gaussians | StrPath, options: CompactOptions | None = None, *, progress: Progress | None = None,
     **settings: Unpack[CompactSettings],
 ) -> CompactResult:  # fmt: skip
     """Replace a scene by a compact one that renders at least as well from new viewpoints.
 
     Args:
         scene: What :func:`gsmerge.read_scene` returns, or a path that it can read. A scene of tensors gives a result of
-            tensors.
+            tensors. Gaussians alone are compacted as a file without cameras.
         options: Settings of all stages; None: the defaults.
         progress: Called with (stage, done, stages); long stages also call ``progress`` with ("fit: ...", step, steps).
         **settings: Single settings by name that override ``options``: ``compact(scene, k=2, superpixels="1%")``.

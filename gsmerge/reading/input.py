@@ -21,13 +21,18 @@ from gsmerge.runtime.documents import file_sha256
 from gsmerge.runtime.memory import release_memory
 from gsmerge.runtime.record import note
 from gsmerge.settings.reading import OpacityChoice
-from gsmerge.types import Scene, StrPath
+from gsmerge.types import NO_CAMERAS, Gaussians, Scene, StrPath, make_scene
 
 TOLERANCE = 1e-3  # opacities and images may lie outside [0, 1] by this much
 
 
-def as_scene(scene: Scene | StrPath) -> Scene:
-    """Check a scene and return it unchanged, or read it from a path; notes of reading go into the record of the run."""
+def as_scene(scene: Scene | Gaussians | StrPath) -> Scene:
+    """Check a scene and return it unchanged, or read it from a path; notes of reading go into the record of the run.
+
+    Gaussians alone become a scene without views.
+    """
+    if isinstance(scene, Gaussians):
+        scene = make_scene(scene, NO_CAMERAS)
     if isinstance(scene, Scene):
         check_scene(scene)
     else:

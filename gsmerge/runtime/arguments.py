@@ -42,6 +42,7 @@ REMEDIES = {
     "Mapping": 'pass {"a name": result}',
     "Scene": "gsmerge.read_scene(path) reads one; tensors go to gsmerge.compact_tensors",
     "Gaussians": "pass the .gaussians of a result",
+    "CompactOptions": 'settings are named, as in compact(scene, budget="2%"), and .save(path) of the result writes it',
 }
 
 

@@ -49,6 +49,8 @@ class BudgetOptions(Settings):
     def __post_init__(self) -> None:
         if self.quality is not None:
             parse_quality(self.quality)
+        if isinstance(self.budget, float):  # the error says which share may be meant
+            parse_budget(str(self.budget), sys.maxsize)
         super().__post_init__()
         word = str(self.budget).strip().lower()
         if word in (AUTO, *DEVICES):

@@ -186,6 +186,8 @@ class CompactOptions(Settings):
             hint = suggest_name(unknown[0], all_settings)
             if unknown[0] in SCENE_ARGUMENTS:
                 hint = f": read_scene(path, {unknown[0]}=...) takes it"
+            if unknown[0] in ("output", "out", "path", "overwrite"):
+                hint = ": result.save(path) writes the result, in the format of the ending"
             known = f"; known: {', '.join(sorted(all_settings))}"
             raise ValueError(f"unknown setting {unknown[0]!r}{hint or known}")
         return super().with_settings({**RECIPES.get(str(settings.get("recipe")), {}), **settings})

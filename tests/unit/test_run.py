@@ -6,6 +6,7 @@ import json
 import logging
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from exports import export_rows, save_export, smooth_scene
 from messages import names
 
 import gsmerge
-from gsmerge.types import Scene
+from gsmerge.types import NO_CAMERAS, Scene
 
 
 def make_scene() -> Scene:
@@ -107,8 +108,9 @@ CALLS: dict[str, Callable[[], Any]] = {
     "more: expected a path, got int": lambda: ANY.read_scene("a.ply", 3),
     "images: expected a path, got ndarray": lambda: ANY.inspect("a.ply", images=np.zeros(3)),
     "progress: expected a function, got int": lambda: ANY.compact(SCENE, progress=3),
-    "scene: expected Scene or a path, got Gaussians; gsmerge.read_scene": lambda: ANY.compact(SCENE.gaussians),
-    "options: expected CompactOptions, got dict": lambda: ANY.compact(SCENE, {"k": 2}),
+    "scene: expected Scene or Gaussians or a path, got int; gsmerge.read_scene": lambda: ANY.compact(5),
+    "options: expected CompactOptions, got dict; settings are named": lambda: ANY.compact(SCENE, {"k": 2}),
+    "unknown setting 'output': result.save(path)": lambda: ANY.compact(SCENE, output="small.ply"),
     "path: expected a path, got Gaussians": lambda: ANY.write_ply(SCENE.gaussians, "a.ply"),
     "gaussians: expected Gaussians, got CompactResult; pass": lambda: ANY.write_ply("a.ply", RESULT),
     "levels: expected Sequence[Gaussians], got Gaussians": lambda: ANY.write_levels("lod-meta.json", SCENE.gaussians),
@@ -123,6 +125,24 @@ def test_other_arguments_are_refused_in_one_line(line: str) -> None:
     with pytest.raises(TypeError if re.match(r"\w+: ", line) else ValueError) as caught:
         CALLS[line]()
     assert str(caught.value).startswith(line)
+
+
+def test_a_share_as_a_number_is_refused_with_the_share_as_text() -> None:
+    with pytest.raises(ValueError, match=r'^budget: .*perhaps "5%"'):
+        ANY.compact(SCENE, budget=0.05)
+
+
+@pytest.mark.parametrize(("name", "use"), [("load", "read_scene"), ("convert", "write_gaussians")])
+def test_names_of_other_packages_lead_to_those_of_this_one(name: str, use: str) -> None:
+    with pytest.raises(AttributeError, match=rf"'{name}'; use .*{use}"):
+        getattr(gsmerge, name)
+
+
+def test_gaussians_alone_are_a_scene_without_views() -> None:
+    alone = replace(SCENE, cameras=NO_CAMERAS, images=None, pixels=None, names=())
+    one, other = (gsmerge.compact(each, budget=40, effort="draft") for each in (SCENE.gaussians, alone))
+    assert one.gaussians == other.gaussians
+    assert "40 Gaussians" in gsmerge.view(one).headline  # a result brings the scene that it was made from
 
 
 def test_a_result_is_taken_where_its_gaussians_are_meant(tmp_path: Path) -> None:

@@ -69,7 +69,7 @@ def check_page_name(path: Path) -> None:
 
 @check_arguments
 def view(
-    scene: Scene | StrPath,
+    scene: Scene | HasGaussians | Gaussians | StrPath,
     results: Mapping[str, HasGaussians | Gaussians | StrPath] | HasGaussians | Gaussians | StrPath | None = None,
     held_out: Views | None = None,
     *,
@@ -79,7 +79,8 @@ def view(
     """Show a scene, alone or beside results: photos, a swipe, 3D and scores, as ``gsmerge view`` does.
 
     Args:
-        scene: A scene from :func:`gsmerge.read_scene`, or the path that it reads.
+        scene: A scene from :func:`gsmerge.read_scene`, or the path that it reads. A result alone is shown beside its
+            scene.
         results: Results of the scene by name, or one result. A result comes from :func:`gsmerge.compact`, or is
             Gaussians, or the path of a file.
         held_out: Views with photos that were not part of the input, for scores.
@@ -97,8 +98,12 @@ def view(
         >>> page.save("demo/small.html", overwrite=True).name
         'small.html'
     """
+    if results is None and hasattr(scene, "show"):
+        page: Page = scene.show()
+        return page
     with record_run(progress):
-        input_scene = as_scene(scene).numpy()
+        given = scene if isinstance(scene, Scene | str | PathLike) else own_gaussians(scene)
+        input_scene = as_scene(given).numpy()
         shown_scene = add_views(input_scene, shown=True)  # viewpoints are placed for a scene without views
     named = results if isinstance(results, Mapping) else {"result": results}
     if results is None:
