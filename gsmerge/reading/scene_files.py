@@ -49,7 +49,7 @@ _holds_views = LazyFunction("gsmerge.io.formats.gsm", "holds_views")
 PLY_PLACES = ("scene.ply", "gaussians.ply", "gs_ply/0000.ply", "point_cloud.ply")
 # Places where INRIA and gsplat write trained scenes. Of several trained scenes, the scene with the most steps of
 # training is read
-TRAINED_PLACES = ("point_cloud/iteration_*/point_cloud.ply", "ply/point_cloud_*.ply")
+TRAINED_PLACES = ("point_cloud/iteration_*/point_cloud.ply", "iteration_*/point_cloud.ply", "ply/point_cloud_*.ply")
 SCENES_PLACE = "gaussians"  # folder where DepthSplat and its relatives write NAME.ply; the photos are in images/NAME
 KINDS = {"images": "photos"}  # option -> kind of the files that it names, if users call the kind otherwise
 MASK_PLACES = ("masks", "keyframes/masks")
@@ -57,16 +57,16 @@ _OTHER_PICTURES = {"masks", "targets"}  # folders of pictures that are no photos
 _POINT_CLOUDS = {"input.ply", "points3D.ply", "points.ply", "sparse_pc.ply"}  # names of point clouds of other programs
 _NUMBERED = re.compile(r"(.*?)[-_. ]?(\d+)\.ply")
 _STEPS = re.compile(r"(?:iteration|point_cloud)_(\d+)(?:\.ply|[\\/]point_cloud\.ply)$")
-_EXPORT = re.compile(r"(.*?)[-_. ]?(\d+)(\.[a-z.]+)", re.IGNORECASE)
+# Words before the number in a file's name, which say that the file holds one view or one part of a scene
+_PARTS = {"view", "chunk", "part", "block", "tile"}
+_EXPORT = re.compile(r"(.*?)[-_. ]?(\d+)(k?\.[a-z.]+)", re.IGNORECASE)  # 30k stands for 30,000
 # Words before the number in names of steps of a training, and in names of files that are no steps
-_STEP_WORDS = {"export", "splat", "splats", "step", "iter", "iteration", "ckpt", "checkpoint", "cloud", "model"}
-_OTHER_WORDS = {"", "frame", "image", "img", "camera", "cam", "scene", "time", "moment"}
+_STEP_WORDS = "export", "splat", "splats", "step", "iter", "iteration", "ckpt", "checkpoint", "cloud", "model"
+_OTHER_WORDS = "", "frame", "image", "img", "camera", "cam", "scene", "time", "moment", *_PARTS
 # Ends of paths that a program gives to all its scenes, so that these ends do not name a scene
 _USUAL_END = re.compile(
     r"/(?:(?:exports/)?gs_ply/\d+|(?:point_cloud/iteration_\d+/)?point_cloud|ply/point_cloud_\d+|scene|gaussians)$"
 )
-# Words before the number in a file's name, which say that the file holds one view or one part of a scene
-_PARTS = {"view", "chunk", "part", "block", "tile"}
 _LEVEL = re.compile(r"\.level\d+(?=\.)")  # in the name of a level of detail, see :func:`level_output`
 _RESULT = re.compile(r"\.compact(\.level\d+)?(\.compressed)?\.ply$")
 _PACKED = {*SCENE_SUFFIXES} - {".ply"}
@@ -228,13 +228,10 @@ def find_scene_files(
         return SceneFiles(path, camera_path or views_file, photos, mask_path, protect, named=named)
     plys = [path]
     num_copies = 0
-    num_steps = 0
     if os.path.isdir(path):
         plys = find_plys(path, camera_path)
         num_copies = len(list_plys(path)) - len(plys)
     ply = plys[0]
-    if path != ply or within is not None:
-        num_steps = [*_find_steps([*ply.parent.glob(f"[!.]*{ply.suffix}")]).values()].count(ply)
     for part in plys:
         check_file(part)
         if part.suffix.lower() in SEVERAL_USES:
@@ -258,9 +255,10 @@ def find_scene_files(
         beside_photos = nearest if images is None or image_path is None else image_path.parent
         mask_path = _find_pictures("masks", MASK_PLACES, [beside_photos, *own_roots], ply)
     parts = tuple(plys) if len(plys) > 1 else ()
+    steps = [] if path == ply and within is None else list(_find_steps(list(ply.parent.glob("[!.]*"))).values())
     pictures = image_path, mask_path, protect
     files = SceneFiles(
-        ply, camera_path, *pictures, parts=parts, num_copies=num_copies, num_steps=num_steps, named=named,
+        ply, camera_path, *pictures, parts=parts, num_copies=num_copies, num_steps=steps.count(ply), named=named,
         others=tuple(others), below=below, root=roots[0], folder=None if ply == path else path,
     )  # fmt: skip
     return replace(files, above=_find_above(files, own_roots))
@@ -573,23 +571,24 @@ def _find_steps(paths: Sequence[Path]) -> dict[Path, Path]:
     """Map files of earlier steps of a training to the file of its last step; their names tell them from other numbers.
 
     Trainers save at multiples of hundreds, or one less where steps count from 0, and at the end. Moments and parts have
-    numbers in a row. Without a word such as "export", several thousands have to agree.
+    numbers in a row. Without a word such as "export", the last number has to be at least 1,000.
     """
     groups = dict[tuple[str, str], dict[int, Path]]()  # name without the number, and ending -> number -> file
     for path in paths:
         match = _EXPORT.fullmatch(path.name)
         if match is not None:
-            groups.setdefault((match[1], match[3]), {})[int(match[2])] = path
+            number = int(match[2]) * (1000 if match[3][0] in "kK" else 1)
+            groups.setdefault((match[1].lower(), match[3]), {})[number] = path
     last_steps = dict[Path, Path]()
     unit = 100  # steps
     for (name, _), path_of in groups.items():
         *early, last = sorted(path_of)
-        word = re.split(r"[-_. ]", name.lower())[-1]
+        word = re.split(r"[-_. ]", name)[-1]
         is_training = word in _STEP_WORDS and (len(early) > 1 or last - sum(early) >= unit)
-        is_known = is_training or (word not in _PARTS | _OTHER_WORDS and last >= 10 * unit)
         numbers = early if is_training else [*early, last]  # a training may end at any step
-        if early and is_known and {number % unit for number in numbers} in ({0}, {unit - 1}):
-            last_steps |= {path_of[number]: path_of[last] for number in early}
+        is_known = is_training or (word not in _OTHER_WORDS and last >= 10 * unit)
+        if is_known and {number % unit for number in numbers} in ({0}, {unit - 1}):
+            last_steps |= dict.fromkeys((path_of[number] for number in early), path_of[last])
     return last_steps
 
 

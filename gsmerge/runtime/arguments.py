@@ -65,8 +65,7 @@ def check_arguments(function: Function) -> Function:
             for value in values:
                 _check_value(name, checked[name], value)
             if "StrPath" in checked[name]:
-                paths = tuple(expand_home(value) if isinstance(value, str | os.PathLike) else value for value in values)
-                arguments[name] = paths if is_variadic else paths[0]
+                arguments[name] = tuple(map(expand_home, values)) if is_variadic else expand_home(values[0])
         return function(*bound.args, **bound.kwargs)
 
     return cast("Function", call)
@@ -75,16 +74,15 @@ def check_arguments(function: Function) -> Function:
 def expand_home(path: Any) -> Any:
     """Return a path whose leading ~ is replaced by the home folder, unless a file or folder has the name as it stands.
 
-    A name such as ~scan, which is no user's, stays as it is. Raise SceneError where no home folder is known.
+    A name such as ~scan, which is no user's, stays as it is, and so does what is no path. Raise SceneError where no
+    home folder is known.
     """
-    text = os.fspath(path)
-    start = Path(text).parts[:1] if isinstance(text, str) and text.startswith("~") else ()
-    if not start or os.path.lexists(start[0]):
+    if not (isinstance(path, str | Path) and str(path).startswith("~")) or os.path.lexists(Path(path).parts[0]):
         return path
-    expanded = os.path.expanduser(text)
-    if expanded == text and start == ("~",):
-        raise SceneError(text, "expected a home folder for ~, found none", "set HOME, or name the whole path")
-    return type(path)(expanded) if isinstance(path, Path) else expanded
+    expanded = os.path.expanduser(path)
+    if expanded == str(path) and Path(path).parts[0] == "~":
+        raise SceneError(path, "expected a home folder for ~, found none", "set HOME, or name the whole path")
+    return type(path)(expanded)
 
 
 def check_fields(value: Any) -> None:

@@ -56,7 +56,7 @@ PALETTE_BITS = 16  # bits of an index in the palette
 PALETTE_COLUMNS = 64  # entries of the palette that are side by side in its texture
 PACKED_BYTES = 19  # bytes of a Gaussian in the decoded textures
 CODES = 256  # number of values in a codebook
-_GSPLAT = "train with simple_trainer --save_ply, or write PngCompression().decompress(FOLDER) with gsplat.export_splats"
+_GSPLAT = "train with the option save_ply of simple_trainer, or decompress it and call gsplat.export_splats"
 _CELLS = 1 << 11  # number of cells of equal width, and of cells with equal counts of values, before any are merged
 
 

@@ -253,10 +253,8 @@ def _read_list(file: Path, search: _Search) -> Iterator[NamedScene]:
             )
         entries[line.strip()] = None
         budget.check_memory(job_bytes * len(entries), count_words(len(entries), "scene"))
-    named = [entry for entry in entries if entry and not entry.startswith("#")]
-    are_inside = [os.path.lexists(file.parent / entry) for entry in named]  # then ~ is a part of the name
-    places = (entry if inside else expand_home(entry) for entry, inside in zip(named, are_inside, strict=True))
-    paths = [file.parent / place for place in places]
+    named = (entry for entry in entries if entry and not entry.startswith("#"))
+    paths = [file.parent / (entry if os.path.lexists(file.parent / entry) else expand_home(entry)) for entry in named]
     for path in sorted(paths, key=count_links):
         if not os.path.isdir(path):
             yield path, None

@@ -56,6 +56,7 @@ def test_last_step_of_a_trained_model_is_the_scene(tmp_path: Path, tiny: Tiny) -
     assert actual.ply == tmp_path / "point_cloud/iteration_30000/point_cloud.ply"
     assert actual.cameras == tmp_path / "cameras.json"
     assert find_scene_files(actual.ply).cameras == tmp_path / "cameras.json"
+    assert find_scene_files(tmp_path / "point_cloud").ply == actual.ply
 
 
 @pytest.mark.parametrize(
@@ -63,6 +64,7 @@ def test_last_step_of_a_trained_model_is_the_scene(tmp_path: Path, tiny: Tiny) -
     [
         ("export_5000 export_10000 export_30000", "export_30000"), ("step-000009999 step-000029999", "step-000029999"),
         ("iter_7000 iter_30000 room.compact", "iter_30000"), ("bicycle_7000 bicycle_30000", "bicycle_30000"),
+        ("garden_7k garden_30k", "garden_30k"),
         ("ckpt_100 ckpt_200 ckpt_273", "ckpt_273"), ("ckpt_100 ckpt_500 ckpt_612", "ckpt_612"),
         ("export_0 export_1 export_2", None), ("tile_100 tile_300", None), ("frame_1000 frame_2000", None),
         ("splat_100 splat_101", None), ("0000 1000", None), ("room_100 room_200", None), ("export_100 room", None),

@@ -71,7 +71,7 @@ def test_a_compressed_checkpoint_of_gsplat_is_named(tmp_path: Path) -> None:
     meta = tmp_path / "meta.json"
     meta.write_text(json.dumps(dict.fromkeys(names, values)))
     for path in (tmp_path, meta):
-        with refuses(SceneError, meta, "gsplat", "PngCompression", "--save_ply"):
+        with refuses(SceneError, meta, "gsplat", "PngCompression", "save_ply"):
             read_gaussians(path)
     meta.write_text(json.dumps({name: values | {"files": [f"{name}.webp"]} for name in names}))
     with refuses(SceneError, meta, "found 1"):
