@@ -9,6 +9,7 @@ from gsmerge.errors import Doubt, DoubtWarning, SceneError, attempt, name_notes
 from gsmerge.frozen import replace
 from gsmerge.io.cameras.camera_file import to_cameras
 from gsmerge.io.formats.read_gaussians import GaussianFile, read_gaussians, read_parts
+from gsmerge.io.formats.table import PLY
 from gsmerge.io.photo_files import NO_IMAGES, as_floats, photo_size
 from gsmerge.reading.alignment import AlignmentResult, check_cameras, check_pixels
 from gsmerge.reading.candidates import list_candidates, parse_views, read_scene_cameras
@@ -159,7 +160,7 @@ def read_gaussian_file(files: SceneFiles, *, opacity: OpacityChoice, hints: Read
     """
     exporter = find_exporter(hints.exporter)
     # Raw opacities are not assumed for an exporter that writes them, since some of its versions write logits
-    if exporter is not None and exporter.opacity == "logit" and opacity == "auto":
+    if exporter is not None and exporter.opacity == "logit" and opacity == "auto" and PLY.names(files.ply):
         opacity = "logit"
     encodings: dict[str, Any] = {"opacity": opacity, "scales": hints.scales, "colors": hints.colors}
     return read_parts(files.parts, **encodings) if files.parts else read_gaussians(files.ply, **encodings)

@@ -72,7 +72,7 @@ def _counts_up(ids: np.ndarray) -> bool:
 
 
 def confirm_colors(load: Loaded) -> Loaded:
-    """Read colours as RGB instead of harmonics, or vice versa, if the file allows both and the photos fit better."""
+    """Read colours as RGB or its logits instead of harmonics, or RGB as harmonics, if photos fit that better."""
     old_info = load.info
     units = load.info.open_units
     images = load.scene.images
@@ -80,7 +80,7 @@ def confirm_colors(load: Loaded) -> Loaded:
         return load
     was_rgb = old_info.color_units is not None  # the colours were read as RGB, and harmonics are tried here
     sh0 = load.scene.gaussians.sh0
-    sh0 = units.black + (units.white - units.black) * sh0_to_rgb(sh0) if was_rgb else rgb_to_sh0(units.rgb(sh0))
+    sh0 = units.stored(sh0_to_rgb(sh0)) if was_rgb else rgb_to_sh0(units.rgb(sh0))
     other = replace(load.scene, gaussians=replace(load.scene.gaussians, sh0=sh0.astype(np.float32)))
     errors = []  # of blocks of both scenes' pictures, against the same blocks of the photos
     for scene in (load.scene, other):

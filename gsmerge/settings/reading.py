@@ -10,7 +10,7 @@ from gsmerge.settings.setting import Settings, setting
 
 OpacityChoice = Literal["auto", "logit", "raw"]
 ScaleChoice = Literal["auto", "log", "linear"]
-ColorChoice = Literal["auto", "sh", "rgb"]
+ColorChoice = Literal["auto", "sh", "rgb", "logit"]
 QuatChoice = Literal["wxyz", "xyzw"]
 Order = Literal["auto", "view-major", "view-fastest", "none"]
 
@@ -26,8 +26,8 @@ class ReadHints(Settings):
     quats: QuatChoice = setting("wxyz", "How the file stores rotations: wxyz, or xyzw (w last).")
     scales: ScaleChoice = setting("auto", "How the file stores scales: log or linear; auto reads them as logarithms, "
         "unless the size of the scene shows that they are linear.")  # fmt: skip
-    colors: ColorChoice = setting("auto", "What the file stores as f_dc: sh (harmonics) or rgb; auto reads them as "
-        "harmonics, unless all end at black and white as RGB does.")  # fmt: skip
+    colors: ColorChoice = setting("auto", "What the file stores as f_dc: sh (harmonics), rgb or logit (of rgb); "
+        "auto reads them as harmonics, unless all end at black and white as RGB does.")  # fmt: skip
     order: Order = setting("auto", "Order of the rows: view-major (view by view, line by line), view-fastest (the "
         "views of a pixel together), or none: the Gaussians belong to no pixels; auto tries all.")  # fmt: skip
     scene_scale: float | None = setting(None, "Scale of the Gaussians' world relative to that of the cameras; null: "

@@ -23,7 +23,7 @@ from gsmerge.counts import curve
 from gsmerge.drawing import render_files as drawings
 from gsmerge.drawing.pages import data, splats
 from gsmerge.io import bounds, photo_files
-from gsmerge.io.formats import ply
+from gsmerge.io.formats import ply, units
 from gsmerge.method.facts import agreement, scene_size
 from gsmerge.method.facts.prepared import LEAST_VIEWS
 from gsmerge.method.fit import outside, photo_sizes, schedule, stage
@@ -186,7 +186,7 @@ CLAIMS: dict[str, tuple[str, ...]] = {
         f"a Gaussian window of {metrics.WINDOW} x {metrics.WINDOW} pixels, sigma {metrics.SIGMA:g}",
         f"larger than a {part(scene_size.LARGE_SCALE)} of the scene",
         f"base colours are beyond {scene_size.BRIGHT_COLOR:g}",
-        f"logits of opacities (within +-{ply.MAX_LOGIT:g})",
+        f"logits of opacities (within +-{units.MAX_LOGIT:g})",
     ),
     EXPORTERS: (
         f"is at most {part(rows_first._PLAIN_PX)} a pixel in every view",

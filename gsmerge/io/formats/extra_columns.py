@@ -11,6 +11,7 @@ from gsmerge.errors import SceneError
 from gsmerge.io.formats import ply
 from gsmerge.io.formats.columns import describes_places, list_names
 from gsmerge.io.formats.read_gaussians import FileInfo
+from gsmerge.io.formats.rows import read_columns
 from gsmerge.io.formats.table import PLY, Format
 
 
@@ -26,7 +27,7 @@ def read_extra_columns(info: FileInfo) -> np.ndarray:
     if len(rows) != info.count:
         problem = f"expected {info.count:,} rows, found {len(rows):,}, since the file changed while it was read"
         raise SceneError(path, problem, "run the command again")
-    return ply.read_columns(rows, info.extra_columns)
+    return read_columns(rows, info.extra_columns)
 
 
 def join_extra_columns(parts: Sequence[np.ndarray]) -> tuple[np.ndarray, list[str]]:

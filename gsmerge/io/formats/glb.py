@@ -13,6 +13,7 @@ import json
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import IO, Any
 
@@ -26,7 +27,6 @@ from gsmerge.io.formats.rows import (
     Columns,
     Packed,
     StoredRows,
-    are_logarithms,
     column_blocks,
     note_surplus,
     rotator,
@@ -217,6 +217,7 @@ def read_rows(path: Path) -> StoredRows:
     return replace(
         to_stored(parts, ".glb", sizes),
         format="binary little-endian",
+        is_open="gsmerge" not in str(document.get("asset")) and any(part.unpack_logs for part in parts),
         notes=note_surplus(budget.file_bytes - total, _FILE_HEAD.size),
     )
 
@@ -360,26 +361,24 @@ def _read_splats(
     count = len(means.stored)
     if any(len(values.stored) != count for values in (quats, scales, opacities, sh0, *harmonics)):
         raise _ForeignError(f"one whose attributes do not all have {count} values, one per Gaussian")
-    if are_logarithms(scales.stored):
-        raise _ForeignError("one whose scales are below 0, as those of drafts of the extension")
     transform_columns = _transformer(transform, len(harmonics))
 
-    def unpack(block: slice) -> Columns:
-        """Return the Gaussians of a block of rows."""
+    def unpack(block: slice, *, are_logs: bool = False) -> Columns:
+        """Return the Gaussians of a block of rows; drafts of the extension stored scales as logarithms."""
         means_block = means[block]
         # np.stack needs at least one array, so an array of zeros is put before the harmonics and cut off again
         return transform_columns(
             Columns(
                 means=means_block,
                 quats=np.roll(quats[block], 1, axis=1),  # xyzw to wxyz
-                log_scales=log(scales[block]),
+                log_scales=scales[block] if are_logs else log(scales[block]),
                 opacities=opacities[block][:, 0],
                 sh0=sh0[block],
                 harmonics=np.stack([np.zeros_like(means_block), *(values[block] for values in harmonics)], 1)[:, 1:],
             )
         )
 
-    return Packed(count, len(harmonics), unpack)
+    return Packed(count, len(harmonics), unpack, partial(unpack, are_logs=True))
 
 
 def _transformer(transform: np.ndarray, num_higher: int) -> Callable[[Columns], Columns]:

@@ -23,6 +23,7 @@ from plyfile import PlyData, PlyElementParseError, PlyParseError
 from gsmerge.errors import SceneError, UsageError, count_words
 from gsmerge.io.bounds import ReadBudget, read_budget, read_errors
 from gsmerge.io.formats import rows as arrays
+from gsmerge.io.formats import units
 from gsmerge.io.formats.columns import check_columns
 from gsmerge.io.formats.rows import FileRows, truncated
 from gsmerge.io.image_names import IMAGE_SUFFIXES, OTHER_SUFFIXES
@@ -38,8 +39,6 @@ MAX_DEGREE = 3  # of the harmonics in results; splat-transform 3.7 and gsply ref
 COMMENT_BYTES = len(f"comment {arrays.new_views_comment(arrays.ExpectedScores(-100, -100, -100, -100))}\n")
 MAX_READ_DEGREE = 4  # of harmonics in files of other programs
 THIN = 1e-3  # third scale of a 2D Gaussian, relative to its smaller scale
-MAX_LOGIT = 16.0  # from 16.6 on, the sigmoid rounds to 1 in float32, and the logit of 1 is infinite
-BLOCK_BYTES = 1 << 19  # bytes of rows that are converted at a time; they stay in the processor's cache
 
 _PREFIXED = "the prefix {!r} of the columns' names, as CloudCompare writes it, is ignored"
 MAX_HEADER_BYTES = 1 << 20
@@ -109,7 +108,7 @@ def read_rows(path: Path) -> arrays.StoredRows:
         problem = f"expected columns {numbers} or none, found {len(rest)} f_rest columns"
         raise SceneError(path, problem, "export it again")
     has_float_rgb = colors != arrays.SH0 and rows.dtype[colors[0]].kind == "f"
-    if has_float_rgb and np.nanmedian(read_columns(rows, colors[:1])[colors[0]]) > 1:
+    if has_float_rgb and units.are_bytes(arrays.read_columns(rows, colors[:1])[colors[0]]):
         white = 255.0
         notes.append(f"colours are read as 0 to 255, since half of the values of {colors[0]} are above 1")
     if arrays.SCALES[2] not in names:
@@ -176,17 +175,6 @@ def _check_places(path: Path, rows: arrays.Rows) -> None:
                 f"expected rotations in {arrays.QUATS[0]} to {arrays.QUATS[3]}, found all values of a row {places}"
             )
             raise SceneError(path, problem, "copy or export it again")
-
-
-def read_columns(rows: arrays.Rows, names: Sequence[str]) -> np.ndarray:
-    """Read some columns of rows, block by block, as a structured array ``[n]`` of little-endian values."""
-    out = np.empty(len(rows), [(name, rows.dtype[name].newbyteorder("<")) for name in names])
-    block_rows = max(1, BLOCK_BYTES // rows.dtype.itemsize)
-    for start in range(0, len(rows), block_rows):
-        block = rows[start : start + block_rows]
-        for name in names:
-            out[name][start : start + block_rows] = block[name]
-    return out
 
 
 def _adapt_rows(rows: np.ndarray, *, white: float) -> np.ndarray:
@@ -489,14 +477,14 @@ def ply_blocks(
     extra_types = {} if extra is None else {name: extra.dtype[name].str[1:] for name in extra.dtype.names or ()}
     header, num_columns = _header(len(gaussians), degree, comments, normals=normals, extra=extra_types)
     yield header
-    for start, columns in arrays.column_blocks(gaussians, degree, max(1, BLOCK_BYTES // (4 * num_columns))):
+    for start, columns in arrays.column_blocks(gaussians, degree, max(1, arrays.BLOCK_BYTES // (4 * num_columns))):
         logits = log(columns.opacities) - log1p(-columns.opacities)  # infinite for 0 and 1, NaN outside [0, 1]
         parts = [
             columns.means,
             np.zeros((len(columns), 3 * normals)),
             columns.sh0,
             columns.harmonics.transpose(0, 2, 1).reshape(len(columns), 3 * columns.harmonics.shape[1]),
-            np.clip(logits, -MAX_LOGIT, MAX_LOGIT)[:, None],
+            np.clip(logits, -units.MAX_LOGIT, units.MAX_LOGIT)[:, None],
             columns.log_scales,
             columns.quats,
         ]

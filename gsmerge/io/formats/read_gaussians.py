@@ -14,14 +14,14 @@ from gsmerge.io.formats import ply
 from gsmerge.io.formats import rows as arrays
 from gsmerge.io.formats.rows import MIP, StoredRows, render_mode
 from gsmerge.io.formats.table import META, PLY, READ_ENDINGS, find_format
-from gsmerge.io.formats.units import LINEAR_NOTE, ColorUnits, are_scales_linear, choose_colors, with_linear_scales
+from gsmerge.io.formats.units import ColorUnits, choose_colors, choose_opacities, choose_scales
 from gsmerge.method.geometry.transforms import lower_median, rgb_to_sh0
 from gsmerge.method.kernels.elementary import exp
 from gsmerge.method.kernels.stored_rows import convert_rows
 from gsmerge.runtime.arguments import check_arguments
 from gsmerge.runtime.memory import free_pages, make_array
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.settings.reading import ColorChoice, OpacityChoice, ScaleChoice
+from gsmerge.settings.reading import ColorChoice, FileHints, OpacityChoice, ScaleChoice
 from gsmerge.types import Gaussians, StrPath
 
 MAX_HARMONIC = 1e6  # no scene has larger harmonics; squares and sums of such renders are finite in float32
@@ -53,6 +53,7 @@ class FileInfo:
     num_zero_quats: int  # Gaussians with a zero quaternion, read as the identity
     # One sentence without a full stop that says why the scales are likely wrong; empty if the scales are plausible
     odd_scales: str = ""
+    opacity_note: str = ""  # sentence without a full stop on a guess of ``opacity_encoding``
     color_units: ColorUnits | None = None  # units of RGB in the columns of harmonics; None if these hold harmonics
     color_note: str = ""  # sentence without a full stop that says that ``color_units`` were guessed
     open_units: ColorUnits | None = None  # units of RGB that the columns may have if photos confirm it; None: none
@@ -92,12 +93,11 @@ def file_notes(info: FileInfo) -> tuple[str, ...]:
         (info.num_empty, "empty row", "at the origin, set aside"),
         (info.num_zero_quats, "Gaussian", "with a zero quaternion, read as the identity"),
     )
-    raw = ("opacities lie in [0, 1] and are read as such; if they are logits, use --hint opacity=logit",)
     color_notes = (Note(info.color_note, "colors"),) if info.color_note else ()
-    raw_notes = raw if info.opacity_encoding == "raw" and info.opacity_guessed else ()
+    opacity_notes = (info.opacity_note,) if info.opacity_note else ()
     scale_notes = (Doubt(info.odd_scales),) if info.odd_scales else ()
     count_notes = (count_words(count, noun, rest) for count, noun, rest in counts if count)
-    return (*info.adapted, *color_notes, *raw_notes, *scale_notes, *count_notes)
+    return (*info.adapted, *color_notes, *opacity_notes, *scale_notes, *count_notes)
 
 
 def degree_notes(info: FileInfo) -> tuple[str, ...]:
@@ -122,13 +122,13 @@ def read_ply(
             as logits. Infinite logits are opacities of 0 and 1.
         scales: How scales are stored. "auto" reads them as logarithms, unless the size of the scene shows that
             they are linear.
-        colors: What ``f_dc_*`` hold. "auto" reads them as harmonics, unless they fill the range of RGB and hardly any
-            value lies outside of it.
+        colors: What ``f_dc_*`` hold: harmonics, RGB, or logits of RGB. "auto" reads them as harmonics, unless they fill
+            the range of RGB and hardly any value lies outside of it, or columns red, green and blue show otherwise.
 
     Raises:
         SceneError: If the file cannot be read, lacks columns, or has fewer than 2 finite Gaussians in 1,000 rows.
         ValueError: If ``opacity`` is not "auto", "logit" or "raw", ``scales`` not "auto", "log" or "linear", or
-            ``colors`` not "auto", "sh" or "rgb".
+            ``colors`` not "auto", "sh", "rgb" or "logit".
 
     Example:
         >>> len(gsmerge.read_ply("demo/scene.ply").gaussians)
@@ -148,18 +148,13 @@ def read_parts(
 
     Errors are those of :func:`read_ply`; also raise SceneError if the columns of the files differ.
     """
-    if opacity not in ("auto", "logit", "raw"):
-        raise ValueError(f"opacity: expected 'auto', 'logit' or 'raw', got {opacity!r}")
-    if scales not in ("auto", "log", "linear"):
-        raise ValueError(f"scales: expected 'auto', 'log' or 'linear', got {scales!r}")
-    if colors not in ("auto", "sh", "rgb"):
-        raise ValueError(f"colors: expected 'auto', 'sh' or 'rgb', got {colors!r}")
+    hints = FileHints(opacity=opacity, scales=scales, colors=colors)
     parts = parallel_map(ply.read_rows, paths)
     for path, part in zip(paths, parts, strict=True):
         if part.rows.dtype != parts[0].rows.dtype:
             problem = f"expected the same columns as in {paths[0].name}, found others, so these are no parts of a scene"
             raise SceneError(path, problem, "name one of the files")
-    return convert_stored(paths, parts, opacity, scales, colors)
+    return convert_stored(paths, parts, hints)
 
 
 @check_arguments
@@ -170,8 +165,9 @@ def read_gaussians(
 
     Endings are ``.spz`` (versions 1 to 4), ``.splat``, ``.sog`` (version 2) and ``.glb``. The finest level of a
     ``lod-meta.json`` is read. A ``meta.json``, or its folder, is read as a ``.sog`` without a zip. Files with other
-    endings are read by :func:`read_ply`, which alone needs ``opacity``, ``scales`` and ``colors``. Raise SceneError if
-    the file cannot be read, is damaged, or holds no finite Gaussian. Raise ValueError for an unknown encoding.
+    endings are read by :func:`read_ply`, whose hints ``opacity``, ``scales`` and ``colors`` also count for floats of
+    other formats: of a ``.glb``, and the scales of a ``.splat``. Raise SceneError if the file cannot be read, is
+    damaged, or holds no finite Gaussian. Raise ValueError for an unknown encoding.
 
     Example:
         >>> gsmerge.write_gaussians("demo/small.spz", gsmerge.read_ply("demo/scene.ply").gaussians, overwrite=True)
@@ -186,16 +182,11 @@ def read_gaussians(
         raise SceneError(path, problem, "name the file that it was made from")
     if format_.read is ply.read_rows:
         return read_parts([path], opacity=opacity, scales=scales, colors=colors)
-    return convert_stored([path], [format_.read(path)], "auto")
+    hints = FileHints(opacity=opacity, scales=scales, colors=colors)
+    return convert_stored([path], [format_.read(path)], hints)
 
 
-def convert_stored(
-    paths: Sequence[Path],
-    parts: Sequence[StoredRows],
-    opacity: OpacityChoice,
-    scales: ScaleChoice = "auto",
-    colors: ColorChoice = "auto",
-) -> GaussianFile:
+def convert_stored(paths: Sequence[Path], parts: Sequence[StoredRows], hints: FileHints) -> GaussianFile:
     """Convert the rows of one or several files to Gaussians; damaged or empty rows become invalid.
 
     Counts and bytes in ``info`` are sums over the files. All other facts in ``info`` are those of the first file.
@@ -207,17 +198,18 @@ def convert_stored(
     file_bytes = sum(path.stat().st_size + part.bytes_beside for path, part in zip(paths, parts, strict=True))
     out = _make_arrays(dtype, sum(len(part.rows) for part in parts), file_bytes)
     num_clipped, num_zero_quats = _fill_arrays(parts, out)
-    is_linear, scale_reason = are_scales_linear(path, stored, out, scales)
-    scale_notes = (LINEAR_NOTE.format(scale_reason),) if is_linear and scale_reason else ()
-    if is_linear:
-        parts = list(map(with_linear_scales, parts))
+    change_scales, scale_note, odd_scales = choose_scales(path, stored, out, hints.scales)
+    if change_scales is not None:
+        parts = list(map(change_scales, parts))
         num_clipped, num_zero_quats = _fill_arrays(parts, out)
     damage = _set_aside_impossible(out) if num_clipped else ()
     empty = find_empty(path, out)
-    units, color_note, open_units = choose_colors(stored, out, colors)
+    units, color_note, open_units = choose_colors(stored, out, hints.colors)
     if units is not None:
         out["sh0"][:] = rgb_to_sh0(units.rgb(out["sh0"]))
-    encoding, is_guess = _decode_opacities(paths, parts, out, empty, opacity)
+    shown = _without(out["opacities"], empty)
+    encoding, is_guess, opacity_note = choose_opacities(paths, parts, shown, hints.opacity)
+    _decode_opacities(out, encoding)
     num_nonfinite = clear_invalid(path, out)
     clear_rows(out, empty)
     byte_columns = tuple(name for name in names if dtype[name].itemsize == 1)
@@ -240,14 +232,15 @@ def convert_stored(
         sh_degree=arrays.sh_degree(out["shN"].shape[1]),
         opacity_encoding=encoding,
         opacity_guessed=is_guess,
+        opacity_note=opacity_note,
         num_nonfinite=num_nonfinite,
         num_empty=len(empty),
         num_zero_quats=max(0, num_zero_quats - len(empty)),  # empty rows usually have zero quaternions
-        odd_scales="" if is_linear else scale_reason,
+        odd_scales=odd_scales,
         color_units=units,
         color_note=color_note,
         open_units=open_units,
-        adapted=(*scale_notes, *part_notes, *damage, *_describe_incomplete(out["valid"])),
+        adapted=(*([scale_note] if scale_note else []), *part_notes, *damage, *_describe_incomplete(out["valid"])),
     )
     return GaussianFile(valid=out.pop("valid"), gaussians=Gaussians(**out), info=info)
 
@@ -274,7 +267,7 @@ def _fill_arrays(parts: Sequence[StoredRows], out: dict[str, np.ndarray]) -> tup
     first_row = 0
     for part in parts:
         n = len(part.rows)
-        block_rows = max(1, ply.BLOCK_BYTES // part.rows.dtype.itemsize)
+        block_rows = max(1, arrays.BLOCK_BYTES // part.rows.dtype.itemsize)
         blocks += [(part, slice(start, min(start + block_rows, n)), first_row) for start in range(0, n, block_rows)]
         first_row += n
 
@@ -374,62 +367,16 @@ def _convert_with_numpy(rows: np.ndarray, out: dict[str, np.ndarray]) -> tuple[i
     return int((is_clipped & out["valid"]).sum()), int((is_zero & out["valid"]).sum())
 
 
-def _decode_opacities(
-    paths: Sequence[Path],
-    parts: Sequence[StoredRows],
-    out: dict[str, np.ndarray],
-    empty: np.ndarray,
-    choice: OpacityChoice,
-) -> tuple[str, bool]:
-    """Convert stored opacities to [0, 1], in place; return their encoding, "logit" or "raw", and whether it is a guess.
+def _without(values: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Return values that are NaN in some ``rows``."""
+    out = values if len(rows) == 0 else values.copy()
+    out[rows] = np.nan
+    return out
 
-    For a guess, the opacities of the rows ``empty``, which only pad the file, are ignored. Rows with infinite values
-    other than logits become invalid. Raise SceneError if the values contradict the caller's choice "raw", or if the
-    files have different encodings.
-    """
-    path = paths[0]
+
+def _decode_opacities(out: dict[str, np.ndarray], encoding: str) -> None:
+    """Convert stored opacities to [0, 1], in place; rows with infinite values other than logits become invalid."""
     opacities = out["opacities"]
-    encoding = str(choice)
-    is_guess = False
-    if choice == "raw":
-        finite = np.isfinite(opacities)
-        outside = (np.abs(opacities - 0.5) > 0.5 + arrays.UNIT_ROUNDING) & finite
-        if outside.sum() > arrays.MAX_STRAY * finite.sum():
-            share = 100 * outside.sum() / finite.sum()
-            found = f"found {share:.3g} % outside, like logits"
-            problem = f"expected opacities in [0, 1], as --hint opacity=raw says, {found}"
-            raise SceneError(path, problem, "leave out --hint opacity=raw")
-    if choice == "auto":
-        values = opacities if len(empty) == 0 else opacities.copy()
-        values[empty] = np.nan  # ignored below
-        # A file that declares no encoding, but has at least 100 values, is compared with the others by a guess
-        # encoding -> name of the first part that has it
-        start = 0
-        part_names = dict[str, str]()
-        min_values = 100
-        for part_path, part in zip(paths, parts, strict=True):
-            part_values = values[start : start + len(part.rows)]
-            start += len(part_values)
-            part_encoding = part.encoding
-            if part_encoding is None and len(parts) > 1 and np.isfinite(part_values).sum() >= min_values:
-                part_encoding = "raw" if arrays.lie_in_unit_range(part_values) else "logit"
-            if part_encoding is not None:
-                part_names.setdefault(part_encoding, part_path.name)
-            if len(part_names) > 1:
-                (other, name), _ = part_names.items()
-                problem = f"expected {other} opacities as in {name}, found {part_encoding} opacities"
-                remedy = "export all parts alike; if all are logits, use --hint opacity=logit"
-                raise SceneError(part_path, problem, remedy)
-        declared = next((part.encoding for part in parts if part.encoding is not None), None)
-        finite_values = values[np.isfinite(values)] if declared is None else values[:0]
-        if len(finite_values) and finite_values.min() >= 0 and finite_values.max() <= 255:
-            share = 100 * np.count_nonzero(finite_values > ply.MAX_LOGIT) / len(finite_values)
-            if share > 100 * arrays.MAX_STRAY:
-                found = f"found 0 to 255: {share:.3g} % are above any logit"
-                problem = f"expected opacities as logits or in [0, 1], {found}"
-                raise SceneError(path, problem, "divide them by 255, or for logits use --hint opacity=logit")
-        is_guess = declared is None
-        encoding = declared or ("raw" if arrays.lie_in_unit_range(values) else "logit")
     if encoding == "raw":
         out["valid"] &= np.isfinite(opacities)
         np.clip(opacities, 0, 1, out=opacities)
@@ -438,7 +385,6 @@ def _decode_opacities(
             opacities[:] = exp(np.negative(opacities, out=opacities))
             np.add(opacities, 1, out=opacities)
             np.reciprocal(opacities, out=opacities)
-    return encoding, is_guess
 
 
 def _spread_low_degree(shN: np.ndarray) -> None:

@@ -48,10 +48,10 @@ SCALES = ("scale_0", "scale_1", "scale_2")
 QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")  # of compressed PLYs
 REQUIRED_COLUMNS = (*MEANS, *SH0, "opacity", *SCALES, *QUATS)
-UNIT_ROUNDING = 0.01  # rounding to half floats may move values this far outside [0, 1]
 MAX_STRAY = 0.01  # share of a column's values that may contradict the others, because of rounding and damage
 _EXACT = 1e-5  # largest rounding error of a whole number in a matrix that rotates harmonics
 EXPORT_AGAIN = "copy or export it again"  # remedy for a damaged file
+BLOCK_BYTES = 1 << 19  # bytes of rows that are converted at a time; they stay in the processor's cache
 GAUSSIAN_BYTES = 4 * len(REQUIRED_COLUMNS) + 1  # bytes in memory of a Gaussian of degree 0 with its flag ``valid``
 
 
@@ -150,28 +150,6 @@ def color_columns(names: Collection[str] | None) -> tuple[str, ...]:
     return SH0 if names is None or SH0[0] in names else next(plain, SH0)
 
 
-def lie_in_unit_range(values: np.ndarray) -> bool:
-    """Return whether stored values are opacities or colours in [0, 1], rather than logits or harmonics.
-
-    Rounding and damage may put a few opacities or colours outside of [0, 1]. Of logits and harmonics, about as many lie
-    just outside of this range as just inside. Therefore the function returns True if hardly any value lies outside of
-    it, and fewer lie outside than just inside.
-    """
-    excess = np.abs(values[np.isfinite(values)] - 0.5) - 0.5  # distance outside [0, 1]; negative inside
-    num_outside = int(np.count_nonzero(excess > 0))
-    num_close = int(np.count_nonzero((excess <= 0) & (excess > -UNIT_ROUNDING)))
-    are_few = num_outside < num_close and num_outside < MAX_STRAY * len(excess)
-    return bool(len(excess)) and (are_few or num_outside == 0)
-
-
-def are_logarithms(scales: np.ndarray) -> bool:
-    """Return whether stored scales are logarithms.
-
-    Logarithms of scales are often negative, while linear scales are negative only in damaged files.
-    """
-    return bool(np.count_nonzero(scales < 0) > MAX_STRAY * scales.size)
-
-
 @dataclass(frozen=True, eq=False)
 class Columns:
     """Columns of n Gaussians in the units of most file formats.
@@ -225,6 +203,8 @@ class Packed:
     count: int
     num_higher: int  # harmonics above degree 0
     unpack: Callable[[slice], Columns]
+    # Unpacks a block whose scales are stored as logarithms, against the format's rules; None if the format cannot
+    unpack_logs: Callable[[slice], Columns] | None = None
 
 
 @dataclass(frozen=True)
@@ -319,6 +299,18 @@ class StoredRows:
     bytes_beside: int = 0  # bytes of further files that hold the rows
     notes: tuple[str, ...] = ()  # how the content was adapted, one sentence each, without a full stop
     adapt: Callable[[np.ndarray], np.ndarray] | None = None  # converts a block of rows to the usual columns
+    is_open: bool = False  # True: opacities and colours are floats, which may break the format's rules
+
+
+def read_columns(rows: Rows, names: Sequence[str]) -> np.ndarray:
+    """Read some columns of rows, block by block, as a structured array ``[n]`` of little-endian values."""
+    out = np.empty(len(rows), [(name, rows.dtype[name].newbyteorder("<")) for name in names])
+    block_rows = max(1, BLOCK_BYTES // rows.dtype.itemsize)
+    for start in range(0, len(rows), block_rows):
+        block = rows[start : start + block_rows]
+        for name in names:
+            out[name][start : start + block_rows] = block[name]
+    return out
 
 
 def pack_rows(parts: Sequence[Packed]) -> PackedRows:

@@ -42,17 +42,17 @@ def read_rows(path: Path) -> StoredRows:
     with read_errors(path):
         rows = np.fromfile(path, ROW)
     sizes = {"means": 12, "scales": 12, "sh0": 3, "opacities": 1, "quats": 4}
-    packed = Packed(len(rows), 0, lambda block: _unpack(rows[block]))
+    packed = Packed(len(rows), 0, lambda block: _unpack(rows[block]), lambda block: _unpack(rows[block], are_logs=True))
     return to_stored([packed], ".splat", {name: row_bytes * len(rows) for name, row_bytes in sizes.items()})
 
 
-def _unpack(rows: np.ndarray) -> Columns:
-    """Convert stored rows to Gaussians."""
+def _unpack(rows: np.ndarray, *, are_logs: bool = False) -> Columns:
+    """Convert stored rows to Gaussians; ``are_logs``: against the rules, scales are logarithms."""
     colors = rows["colors"] / 255
     return Columns(
         means=rows["means"],
         quats=(rows["quats"] - 128.0) / 128,
-        log_scales=log(rows["scales"]),
+        log_scales=rows["scales"] if are_logs else log(rows["scales"]),
         opacities=colors[:, 3],
         sh0=rgb_to_sh0(colors[:, :3]),
         harmonics=np.zeros((len(rows), 0, 3)),

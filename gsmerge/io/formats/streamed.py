@@ -31,6 +31,7 @@ from gsmerge.io.formats.splat_transform import blame_program, run_program
 from gsmerge.io.formats.table import INDEX, Contents
 from gsmerge.io.formats.write import write_ply
 from gsmerge.runtime.arguments import check_arguments
+from gsmerge.settings.reading import FileHints
 from gsmerge.types import Gaussians, StrPath
 
 VERSION = 1  # of the format, as the index states it
@@ -247,7 +248,7 @@ def read_rows(path: Path, level: int = 0, index: StreamedIndex | None = None) ->
 
 def read_level(path: Path, level: int, index: StreamedIndex | None = None) -> GaussianFile:
     """Read one level of detail of a ``lod-meta.json``; 0 is the finest. Raise errors as :func:`read_gaussians`."""
-    return convert_stored([path], [read_rows(path, level, index)], "auto")
+    return convert_stored([path], [read_rows(path, level, index)], FileHints())
 
 
 def remove_unused_chunks(path: Path) -> None:
