@@ -19,7 +19,6 @@ _START = 1 << 10  # number of first bytes of a file that are compared with patte
 _REPORTS = b'content="gsmerge ', b'"name": "gsmerge"', b"schema_version,result,"
 _DOWNLOAD = "download it again, in a browser if the page needs a click or a login"
 _UNPACK = "unpack it, and name the scene in it"
-_GLB = "export it as .glb, which is a single file"
 _COPY_AGAIN = "copy or download it again"
 
 
@@ -56,6 +55,7 @@ FOREIGN: dict[str, tuple[str, str]] = {
     **dict.fromkeys((".las", ".laz", ".e57", ".pcd", ".xyz", ".pts", ".ptx"), ("a cloud of points", _TRAIN_OR_MAKE)),
     **dict.fromkeys((".obj", ".fbx", ".stl", ".dae", ".off", ".blend", ".abc"), ("a mesh", _TRAIN_OR_MAKE)),
     **dict.fromkeys((".usd", ".usdz", ".usda", ".usdc"), ("a scene of USD", _EXPORT)),
+    ".gltf": ("glTF in several files", "export it as .glb, which is a single file"),
     ".bgeo": ("a geometry of Houdini", _EXPORT),
     ".ssproj": ("a project of SuperSplat", _EXPORT),
     ".psht": ("a project of Postshot", _EXPORT),
@@ -103,7 +103,6 @@ OTHER_CONTENTS = (
     OtherContent("a 7z archive", r"7z\xbc\xaf\x27\x1c", _UNPACK),
     OtherContent("a rar archive", r"Rar!\x1a\x07", _UNPACK),
     OtherContent("a packed file", r"BZh[1-9]1AY|\xfd7zXZ\0|\x28\xb5\x2f\xfd", _UNPACK),
-    OtherContent("glTF in several files", r"\s*\{", _GLB, refused=(".gltf",)),
     OtherContent("a PLY file", r"ply\r?\n", "change its ending to .ply", refused=_PACKED_SCENES),
     OtherContent(
         "text", r"(?!ply[\r\n])\s*(?P<quote>[ -~\x80-\xff]+)(?:[\t\r\n][\t\r\n -~\x80-\xff]*)?\Z", _DOWNLOAD,
@@ -155,6 +154,6 @@ def check_first_bytes(path: Path, size: int) -> None:
         if match:
             quote = (match.groupdict().get("quote") or b"").decode("utf-8", "replace").strip()
             shown = f" ({' '.join(quote.split())!r:.60})" if quote else ""
-            # An archive or a glTF may have a scene inside
-            expected = "scene" if row.remedy in (_UNPACK, _GLB) else f"{ending} file".strip()
+            # An archive may have a scene inside
+            expected = "scene" if row.remedy == _UNPACK else f"{ending} file".strip()
             raise SceneError(path, f"expected a {expected}, found {row.what}{shown}", row.remedy)

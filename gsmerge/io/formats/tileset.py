@@ -75,7 +75,10 @@ def read_rows(path: Path) -> StoredRows:
     except (LookupError, TypeError, AttributeError):
         has_one_tile = False
     if not has_one_tile:
-        raise SceneError(path, "expected a tileset with one tile, a .glb beside it, found another", "name its tiles")
+        count = str(document).count("'uri'")
+        found = f"found {count}, each with a transform that is not read" if count > 1 else "found another"
+        remedy = "name one of its tiles, or export the whole scene as .ply"
+        raise SceneError(path, f"expected a tileset with one tile, a .glb beside it, {found}", remedy)
     rows = glb.read_rows(path.with_name(name.name))
     return replace(
         rows,

@@ -57,6 +57,7 @@ def leave(folder: Path, tiny: Tiny, name: str) -> None:
         (("pred.npz",), "pred.npz", ("FLARE",)),
         (("camera_poses.txt", "pcd/0_pcd.ply"), "camera_poses.txt", ("DA3-Streaming", "--cameras")),
         (("output.glb",), "output.glb", ("points", "--cameras")),
+        (("scene.gltf", "scene.dat"), "scene.gltf", ("several files", ".glb")),
         (("mesh.ply",), "mesh.ply", ("points", "name")),
         (("notes.txt",), "photos", ("Depth Anything 3", "AnySplat")),
     ],

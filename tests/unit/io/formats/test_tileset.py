@@ -127,6 +127,13 @@ def test_other_tilesets_are_refused(tmp_path: Path, document: object) -> None:
         read_gaussians(tmp_path / "tileset.json")
 
 
+def test_tiles_with_transforms_of_their_own_are_counted(tmp_path: Path) -> None:
+    tiles = [{"content": {"uri": f"{i}.glb"}, "transform": [1.0] * 16} for i in range(3)]
+    (tmp_path / "tileset.json").write_text(json.dumps({"root": {"children": tiles}}))
+    with refuses(SceneError, "tileset.json", "3", "transform", ".ply"):
+        read_gaussians(tmp_path / "tileset.json")
+
+
 def test_a_tile_that_states_bytes_it_lacks_is_refused(room: Gaussians, tmp_path: Path) -> None:
     tile = convert(room, tmp_path).with_name("tileset.glb")
     content = tile.read_bytes()
