@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from functools import partial
 from itertools import chain, product
 from pathlib import Path
 
@@ -24,7 +25,7 @@ from gsmerge.method.kernels.matrices import invert, matmul
 from gsmerge.reading.alignment.conventions import PosesInConvention, other_conventions
 from gsmerge.reading.alignment.frames import axis_turns, exporter_frames
 from gsmerge.reading.alignment.grids import Grid, with_poses
-from gsmerge.reading.alignment.registration.localise import find_frames, mirror
+from gsmerge.reading.alignment.registration.localise import find_frame, mirror
 from gsmerge.reading.alignment.registration.register import compose
 from gsmerge.reading.alignment.score import AlignmentInput, photo_colors
 from gsmerge.types import Cameras, Gaussians
@@ -278,7 +279,7 @@ def is_mirrored(inputs: AlignmentInput) -> bool:
     if inputs.images.any((1, 2, 3)).sum() < 2 or _fits_exactly(inputs, IDENTITY):
         return False
     mirrored = mirror(inputs)
-    return any(_fits_exactly(mirrored, frame) for frame in find_frames(mirrored))
+    return any(_fits_exactly(mirrored, frame) for frame in (IDENTITY, *axis_turns()))
 
 
 def _check_colors(inputs: AlignmentInput, cameras: Cameras, name: str, no_pixels: SceneError) -> None:
@@ -319,15 +320,17 @@ def _choose_frame(inputs: AlignmentInput, usual: CameraCheck, stated: Sequence[S
     stands_out = _stands_out(inputs, best, score)
     # views without a photo are black and do not count; one photo is too few, because it fits somewhere in any scene
     has_photos = inputs.scale is None and inputs.images.any((1, 2, 3)).sum() > 1
+    is_sure = not has_photos  # of all frames
     if has_photos and not (stands_out and _fits_exactly(inputs, best)):
-        found = next((frame for frame in find_frames(inputs) if _fits_exactly(inputs, frame)), None)
+        measure = partial(_measure_foremost, inputs)
+        found, is_sure = find_frame(inputs, measure, partial(_fits_exactly, inputs))
         if found is not None:  # about right; a frame without its errors is chosen if that explains the photos as well
             best, score = _best_frame(inputs, [best, *axis_turns()])
             found_score = _score_frame(inputs, found)
             if found_score > _PEAK_GAIN * score or not _stands_out(inputs, best, score):
                 best, score = found, found_score
             stands_out = True
-    if has_photos and not stands_out:
+    if not (stands_out or is_sure):
         # frames of `exporter_frames`: rotated into the first camera, turned to y up, and moved into the first camera
         solved = [_solve_scale(inputs, frame) for frame in (IDENTITY, frames[1], frames[4], frames[-1])]
         best, score = _best_frame(inputs, [best, *solved, *([] if usual.ok else _solve_shift(inputs))])
@@ -343,22 +346,22 @@ def _fits_exactly(inputs: AlignmentInput, frame: Similarity) -> bool:
 
     If cameras are wrong by two degrees or more, some turn of all of them fits about as well, or better.
     """
-
-    def measure(axis: int, radians: float) -> float:
-        """Return the colour ratio of the foremost Gaussians if cameras are turned about one of their axes."""
-        cameras = frame.move_cameras(inputs.cameras)
-        motion = np.zeros((1, 6))
-        motion[0, axis] = radians
-        cameras = replace(cameras, viewmats=matmul(motion_matrices(motion)[0], cameras.viewmats.astype(np.float64)))
-        checked = inputs.gaussians, inputs.valid, cameras, inputs.images, _COMPARED_GAUSSIANS
-        return check_cameras(*checked, foremost=True).color_ratio
-
-    ratio = measure(0, 0.0)
+    ratio = _measure_foremost(inputs, frame)
     if not ratio > _SURE_RATIO:
         return True
     return ratio <= MAX_FRONT_RATIO and all(
-        measure(axis, turn) > _TURNED * ratio for axis in (0, 1) for turn in (_TURN, -_TURN)
+        _measure_foremost(inputs, frame, axis, turn) > _TURNED * ratio for axis in (0, 1) for turn in (_TURN, -_TURN)
     )
+
+
+def _measure_foremost(inputs: AlignmentInput, frame: Similarity, axis: int = 0, radians: float = 0.0) -> float:
+    """Return the colour ratio of the foremost Gaussians in a frame, if cameras are turned about one of their axes."""
+    cameras = frame.move_cameras(inputs.cameras)
+    motion = np.zeros((1, 6))
+    motion[0, axis] = radians
+    cameras = replace(cameras, viewmats=matmul(motion_matrices(motion)[0], cameras.viewmats.astype(np.float64)))
+    checked = inputs.gaussians, inputs.valid, cameras, inputs.images, _COMPARED_GAUSSIANS
+    return check_cameras(*checked, foremost=True).color_ratio
 
 
 def _score_frame(inputs: AlignmentInput, frame: Similarity, samples: int = _COMPARED_GAUSSIANS) -> float:
@@ -409,7 +412,7 @@ def _solve_scale(inputs: AlignmentInput, frame: Similarity) -> Similarity:
     scores = np.array([_score_frame(inputs, candidate, scale_gaussians) for candidate in scaled])
     two_steps_away = np.maximum(scores[:-4], scores[4:])
     best = scaled[2 + int(np.argmax(scores[2:-2] - two_steps_away))]
-    for max_change, num_scales, samples in _FINER:
+    for max_change, num_scales, samples in _FINER if scores.any() else ():
         factors = exp(np.linspace(-max_change, max_change, num_scales))
         best, _ = _best_frame(inputs, [_scale_frame(best, float(factor)) for factor in factors], samples)
     return best

@@ -41,6 +41,11 @@ DRAWN_PIXELS = 480  # longer side of drawings, and of the photos that are compar
 LEAST_PARALLAX = 0.01  # radians between the rays of a keypoint in two photos, from which its depth is known
 MOST_ERROR = 0.006  # distance of a triangulated point from its keypoints, in diagonals of the picture
 NEAREST, FARTHEST = 1e-3, 1e4  # planes of drawings, in median distances of the Gaussians from their middle
+# Matches of a keypoint of a drawing in a photo: .06 to .2 where most photos show the Gaussians, else .003 to .022
+WRONG_MATCHES = 0.02
+# Colours of Gaussians in a frame of matched keypoints, in distances of wrong pairs: .3 to .85, or if wrong about 1
+WRONG_COLORS = 0.93
+MANY_KEYPOINTS = 500  # in photos, and in drawings: from a tenth as many a frame was found in made scenes
 SOLID = 0.5  # opacity of a drawing from which a depth counts
 COMPARED = 20_000  # Gaussians whose colours are compared with photos
 SIGMAS = (1.0, 0.5)  # pixels by which photos are blurred, one after the other
@@ -52,23 +57,37 @@ PLACES = 2  # most different ones at which viewers may have been
 DISTANCES = (0.5, 1.0, 1.5, 2.5)  # from there, in median distances of the Gaussians
 
 
-def find_frames(inputs: AlignmentInput) -> Iterator[Similarity]:
-    """Find frames in which the photos may show the Gaussians, by their keypoints.
+def find_frame(
+    inputs: AlignmentInput, measure: Callable[[Similarity], float], fits: Callable[[Similarity], bool]
+) -> tuple[Similarity | None, bool]:
+    """Find a frame in which the photos show the Gaussians, by their keypoints.
 
-    The Gaussians are drawn from the cameras as they are, and from where their sizes say that viewers were. Colours have
-    to confirm a frame, since textures that repeat match at wrong places, too.
+    The Gaussians are drawn from the cameras as they are, and from where their sizes say that viewers were. Textures
+    that repeat match at wrong places, too: of matches whose colours, which ``measure`` compares with those of wrong
+    pairs, are no better than these, nothing is refined, and a frame has to fit as ``fits`` says.
+
+    Returns the frame, or None, and whether photos and drawings have so many keypoints that there is no other frame.
     """
     views = [view for view in range(len(inputs.cameras)) if inputs.images[view].any()]
     views = [views[i] for i in even_views(len(views), min(len(views), MOST_PHOTOS))]
     cameras, images = _make_small(inputs, views)
     photos = _triangulate(cameras, parallel_map(lambda image: detect_keypoints(image, 1.0), list(images)))
     gaussians = inputs.gaussians[np.flatnonzero(inputs.valid)]
+    num_points = sum(len(photo.points) for photo in photos)
+    num_drawn = 0
     for viewpoints in chain([cameras], _place_viewers(gaussians, cameras)):
-        frame = _match(photos, gaussians, viewpoints, cameras)
-        if frame is not None:
-            frame = _register_colors(images, gaussians, frame, cameras)
+        drawings = _draw_keypoints(gaussians, viewpoints)
+        count = sum(len(drawing.points) for drawing in drawings)
+        num_drawn = max(num_drawn, count)
+        matches = match_photos((0, 1), photos, drawings, (cameras.width, cameras.height))
+        link = connect(matches) if len(matches) > WRONG_MATCHES * count * len(photos) else None
+        if link is None or measure(link[0]) > WRONG_COLORS:
+            continue
+        frame = min((link[0], _register_colors(images, gaussians, link[0], cameras)), key=measure)
+        if fits(frame):
             unit = float(2.0 ** np.frexp(np.abs(frame.shift).max() + 1e-30)[1])
-            yield describe_frame(round_similarity(frame, unit))
+            return describe_frame(round_similarity(frame, unit)), True
+    return None, min(num_drawn, num_points) >= MANY_KEYPOINTS
 
 
 def mirror(inputs: AlignmentInput) -> AlignmentInput:
@@ -140,15 +159,6 @@ def _reprojection_errors(points: np.ndarray, pixels: np.ndarray, K: np.ndarray, 
     depth = np.maximum(local[:, 2], 1e-9)
     offsets = matmul(local / depth[:, None], K.T)[:, :2] - pixels
     return np.asarray(np.where(local[:, 2] > 0, np.sqrt((offsets * offsets).sum(1)), np.inf))
-
-
-def _match(
-    photos: Sequence[PhotoKeypoints], gaussians: Gaussians, viewpoints: Cameras, cameras: Cameras
-) -> Similarity | None:
-    """Match the keypoints of photos with those of drawings from ``viewpoints``; None if too few agree on a frame."""
-    drawings = _draw_keypoints(gaussians, viewpoints)
-    link = connect(match_photos((0, 1), photos, drawings, (cameras.width, cameras.height)))
-    return None if link is None else link[0]
 
 
 def _draw_keypoints(gaussians: Gaussians, viewpoints: Cameras) -> list[PhotoKeypoints]:

@@ -72,8 +72,8 @@ def test_a_frame_of_keypoints_gives_way_to_a_turn_that_shows_the_same(
     """Where no frame fits exactly, keypoints are matched, and errors of their frame stay out of the cameras."""
     turn = np.eye(3)[[2, 0, 1]]
     near = Similarity(turn, 1.002, np.zeros(3), "by keypoints")
-    monkeypatch.setattr(unaligned, "find_frames", lambda inputs: iter([near]))
-    monkeypatch.setattr(unaligned, "_fits_exactly", lambda inputs, frame: frame is near)
+    monkeypatch.setattr(unaligned, "find_frame", lambda inputs, measure, fits: (near, True))
+    monkeypatch.setattr(unaligned, "_fits_exactly", lambda inputs, frame: False)
     loaded = load_scene(save_export(tmp_path, SMOOTH, turned(voxel_rows(), turn)))
     assert any("to z, x, y" in note for note in loaded.notes)
 
