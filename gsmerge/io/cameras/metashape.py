@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
@@ -26,7 +25,8 @@ _ATTRIBUTES = {"id", "type", "class", "width", "height", "sensor_id", "component
 def list_metashape_cameras(source: CameraSource) -> list[Entry]:
     """List the cameras of the component with the most cameras, each with the values of its sensor.
 
-    Of the cameras of a rig only the master has a pose. The others stand where their sensors do in the master's axes.
+    Of the cameras of a rig only the master has a pose. The others stand where their sensors do in the master's axes,
+    and are left out if the sensor has no place there.
     """
     path = source.path
     chunk, placed = _read_component(path)
@@ -39,16 +39,16 @@ def list_metashape_cameras(source: CameraSource) -> list[Entry]:
         if sensor_id not in sensors:
             raise SceneError(path, f"view {name}: expected the id of one of the sensors, found {sensor_id!r}")
         sensor = sensors[sensor_id]
-        offset = None if camera is master else _read_motion(path, f"sensor {sensor_id}", sensor, "location")
-        if camera is not master and offset is None:
-            continue  # its place in the rig is not known
+        if camera is not master and sensor.find("rotation") is None and sensor.find("location") is None:
+            continue
         if sensor_id not in values:
             expected = "expected a 'calibration' with a 'resolution' and the number 'f'"
             with number_errors(path, f"sensor {sensor_id}: {expected}"):
                 values[sensor_id] = _sensor_values(sensor)
         with number_errors(path, f"view {name}: expected 16 numbers in 'transform'"):
             pose = np.array(master.findtext("transform", "").split(), np.float64).reshape(4, 4)
-        pose = pose if offset is None else matmul(pose, offset)
+        if camera is not master:
+            pose = matmul(pose, _read_motion(path, sensor, "location"))
         entries.append(Entry({"transform": pose}, values[sensor_id], name))
     return entries
 
@@ -64,51 +64,44 @@ def list_metashape_frames(path: Path) -> list[Similarity]:
     frames = list[Similarity]()
     for element in (chunk, *components):
         transform = element.find("transform")
-        motion = None if transform is None else _read_motion(path, element.tag, transform, "translation")
-        if transform is not None and motion is not None:
-            with number_errors(path, f"{element.tag}: expected the number 'scale'"), np.errstate(all="ignore"):
-                scale = float(transform.findtext("scale", "1"))
-                motion[:3, 3] /= scale
-            name = f"moved by the transform of the {element.tag} in {path.name}"
-            for factor, words in ((scale, name), (1.0, f"{name} without its scale")):
-                frames.append(replace(make_similarity(path, motion, factor), description=words))
+        if transform is None:
+            continue
+        motion = _read_motion(path, transform, "translation")
+        with number_errors(path, f"{element.tag}: expected the number 'scale'"), np.errstate(all="ignore"):
+            scale = float(transform.findtext("scale", "1"))
+            motion[:3, 3] /= scale
+        name = f"moved by the transform of the {element.tag} in {path.name}"
+        for factor, words in ((scale, name), (1.0, f"{name} without its scale")):
+            frames.append(replace(make_similarity(path, motion, factor), description=words))
     return frames
 
 
 def _read_component(path: Path) -> tuple[Element, list[tuple[Element, Element]]]:
-    """Read the chunk with the most placed cameras, and those of its component with the most, each with its master.
+    """Read the component with the most placed cameras of all chunks: its chunk, and each camera with its master.
 
     The master of a camera that has a pose is the camera itself.
     """
     root = _read_xml(path, _ATTRIBUTES)
-    found: tuple[Element, list[tuple[Element, Element]]] = root, []
-    for chunk in root.findall("chunk") or [root]:
-        masters = {camera.get("id"): camera for camera in chunk.iter("camera")}
-        pairs = list[tuple[Element, Element]]()
+    components: dict[tuple[int, str | None], tuple[Element, list[tuple[Element, Element]]]] = {}
+    for i, chunk in enumerate(root.findall("chunk") or [root]):
+        cameras = {camera.get("id"): camera for camera in chunk.iter("camera")}
         for camera in chunk.iter("camera"):
             has_pose = camera.find("transform") is not None
-            master = camera if has_pose else masters.get(camera.get("master_id"))
+            master = camera if has_pose else cameras.get(camera.get("master_id"))
             if master is not None and master.find("transform") is not None:
-                pairs.append((camera, master))
-        if len(pairs) > len(found[1]):
-            found = chunk, pairs
-    chunk, pairs = found
-    check_camera_count(path, len(pairs))
-    largest = dict(Counter(master.get("component_id") for _, master in pairs).most_common(1))
-    return chunk, [pair for pair in pairs if pair[1].get("component_id") in largest]
+                component = components.setdefault((i, master.get("component_id")), (chunk, []))
+                component[1].append((camera, master))
+    largest = max(components.values(), key=lambda component: len(component[1]), default=(root, []))
+    check_camera_count(path, len(largest[1]))
+    return largest
 
 
-def _read_motion(path: Path, name: str, element: Element, shift: str) -> np.ndarray | None:
-    """Read a motion ``[4,4]`` of a ``rotation`` row by row and a ``shift``; None if there is neither."""
-    rotation, place = element.findtext("rotation"), element.findtext(shift)
-    if rotation is None and place is None:
-        return None
+def _read_motion(path: Path, element: Element, shift: str) -> np.ndarray:
+    """Read a motion ``[4,4]`` of a ``rotation``, row by row, and a ``shift``; one that is missing changes nothing."""
     motion = np.eye(4)
-    with number_errors(path, f"{name}: expected 9 numbers in 'rotation' and 3 in {shift!r}"):
-        if rotation is not None:
-            motion[:3, :3] = np.array(rotation.split(), np.float64).reshape(3, 3)
-        if place is not None:
-            motion[:3, 3] = np.array(place.split(), np.float64).reshape(3)
+    with number_errors(path, f"{element.tag}: expected 9 numbers in 'rotation' and 3 in {shift!r}"):
+        motion[:3, :3] = np.array(element.findtext("rotation", "1 0 0 0 1 0 0 0 1").split(), np.float64).reshape(3, 3)
+        motion[:3, 3] = np.array(element.findtext(shift, "0 0 0").split(), np.float64).reshape(3)
     return motion
 
 

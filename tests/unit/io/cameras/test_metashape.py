@@ -90,8 +90,8 @@ def test_the_maps_of_chunk_and_component_are_listed(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("move", "found"),
     [
-        ("<rotation>1 2</rotation>", "chunk"),
-        ("<translation>1 2 x</translation>", "chunk"),
+        ("<rotation>1 2</rotation>", "transform"),
+        ("<translation>1 2 x</translation>", "transform"),
         ("<translation>1 2 3</translation><scale>0</scale>", "another map"),
         ("<rotation>1 0 0 0 1 0 0 0 9</rotation>", "another map"),
     ],
