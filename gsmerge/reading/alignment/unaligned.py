@@ -325,9 +325,8 @@ def _choose_frame(inputs: AlignmentInput, usual: CameraCheck, stated: Sequence[S
         measure = partial(_measure_foremost, inputs)
         found, is_sure = find_frame(inputs, measure, partial(_fits_exactly, inputs))
         if found is not None:  # about right; a frame without its errors is chosen if that explains the photos as well
-            best, score = _best_frame(inputs, [best, *axis_turns()])
             found_score = _score_frame(inputs, found)
-            if found_score > _PEAK_GAIN * score or not _stands_out(inputs, best, score):
+            if found_score > _PEAK_GAIN * score or not stands_out:
                 best, score = found, found_score
             stands_out = True
     if not (stands_out or is_sure):

@@ -31,7 +31,13 @@ from gsmerge.reading.alignment.registration.keypoints import (
     place_keypoints,
     to_bytes,
 )
-from gsmerge.reading.alignment.registration.register import compose, connect, invert_similarity, round_similarity
+from gsmerge.reading.alignment.registration.register import (
+    MIN_MATCHES,
+    compose,
+    connect,
+    invert_similarity,
+    round_similarity,
+)
 from gsmerge.reading.alignment.score import AlignmentInput
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians
@@ -45,7 +51,8 @@ NEAREST, FARTHEST = 1e-3, 1e4  # planes of drawings, in median distances of the 
 WRONG_MATCHES = 0.02
 # Colours of Gaussians in a frame of matched keypoints, in distances of wrong pairs: .3 to .85, or if wrong about 1
 WRONG_COLORS = 0.93
-MANY_KEYPOINTS = 500  # in photos, and in drawings: from a tenth as many a frame was found in made scenes
+ABOUT_EQUAL = 0.9  # cosine of 26 degrees between two cameras, up to which keypoints match well
+MANY_KEYPOINTS = 300  # in photos, and in drawings: in made scenes a frame was found from 80 to 290
 SOLID = 0.5  # opacity of a drawing from which a depth counts
 COMPARED = 20_000  # Gaussians whose colours are compared with photos
 SIGMAS = (1.0, 0.5)  # pixels by which photos are blurred, one after the other
@@ -66,14 +73,20 @@ def find_frame(
     that repeat match at wrong places, too: of matches whose colours, which ``measure`` compares with those of wrong
     pairs, are no better than these, nothing is refined, and a frame has to fit as ``fits`` says.
 
-    Returns the frame, or None, and whether photos and drawings have so many keypoints that there is no other frame.
+    Returns the frame, or None, and whether photos and drawings have so many keypoints that there is no other frame:
+    all of them move the cameras together, so photos that do not agree with each other show the Gaussians in none.
     """
     views = [view for view in range(len(inputs.cameras)) if inputs.images[view].any()]
     views = [views[i] for i in even_views(len(views), min(len(views), MOST_PHOTOS))]
     cameras, images = _make_small(inputs, views)
-    photos = _triangulate(cameras, parallel_map(lambda image: detect_keypoints(image, 1.0), list(images)))
-    gaussians = inputs.gaussians[np.flatnonzero(inputs.valid)]
+    found = parallel_map(lambda image: detect_keypoints(image, 1.0), list(images))
+    photos = _triangulate(cameras, found)
     num_points = sum(len(photo.points) for photo in photos)
+    if num_points < MIN_MATCHES:  # where two cameras look about the same way, they are not those of the photos
+        forward = cameras.viewmats[:, 2, :3].astype(np.float64)
+        are_beside = (matmul(forward, forward.T) > ABOUT_EQUAL).sum() > len(cameras)
+        return None, are_beside and sum(len(pixels) for pixels, _ in found) >= MANY_KEYPOINTS
+    gaussians = inputs.gaussians[np.flatnonzero(inputs.valid)]
     num_drawn = 0
     for viewpoints in chain([cameras], _place_viewers(gaussians, cameras)):
         drawings = _draw_keypoints(gaussians, viewpoints)

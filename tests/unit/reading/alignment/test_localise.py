@@ -58,6 +58,15 @@ def test_photos_of_another_scene_show_no_frame(room: Scene) -> None:
     assert frame is None
 
 
+def test_photos_without_anything_in_common_show_no_frame(room: Scene) -> None:
+    rng = np.random.default_rng(0)
+    noise = rng.random((6, HEIGHT // 4, WIDTH // 4, 3)).repeat(4, 1).repeat(4, 2).astype(np.float32)
+    inputs = inputs_of(replace(room, images=noise), room.cameras)
+    assert find_frame(inputs, partial(measure, inputs), lambda frame: True) == (None, True)
+    inputs = inputs_of(replace(room, images=np.full_like(noise, 0.5)), room.cameras)  # too little to see
+    assert find_frame(inputs, partial(measure, inputs), lambda frame: True) == (None, False)
+
+
 def test_a_mirrored_scene_is_named(room: Scene) -> None:
     g = room.gaussians
     flipped = replace(g, means=g.means * np.float32([-1, 1, 1]), quats=g.quats * np.float32([1, 1, -1, -1]))
