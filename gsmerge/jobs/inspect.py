@@ -14,7 +14,7 @@ from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.formats.gsm import list_batches
 from gsmerge.io.formats.ply import is_from_gsmerge
 from gsmerge.io.formats.read_gaussians import degree_notes
-from gsmerge.io.formats.rows import read_expected_scores
+from gsmerge.io.formats.rows import RESULT_COMMENT, read_expected_scores
 from gsmerge.io.photo_files import photo_array
 from gsmerge.jobs.estimate import estimate, estimate_lines
 from gsmerge.method.facts.scene_size import unlike_captures
@@ -81,7 +81,7 @@ def inspect(
         Plain JSON types, None for unknown values. About the file: ``path``, ``bytes``, ``bytes_by_attribute``,
         ``layout``, ``format``, ``exporter``, ``extra_columns``, ``extra_elements``, ``sh_degree``,
         ``opacity_encoding``, ``batches`` (of a state: ``num_views``, ``num_input``, ``num_new``, and the names of its
-        ``views``). About the rows: ``count``, ``num_nonfinite``, ``num_empty``,
+        ``views``), ``is_result`` (of gsmerge). About the rows: ``count``, ``num_nonfinite``, ``num_empty``,
         ``num_zero_quats``, ``num_opaque`` (from 0.995 on), ``num_transparent`` (below 1/255), ``num_saturated``
         (within 1e-6 of 0 or 1), ``extents``. About the views: ``cameras``, ``camera_format``, ``images``,
         ``num_views``, ``width``, ``height``, ``num_missing`` (pixels without a Gaussian), ``rows``
@@ -131,17 +131,18 @@ def inspect(
 
 def _describe_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> dict[str, Any]:
     """Describe the views of a scene, and whether its rows belong to pixels; see :func:`inspect` for the keys."""
-    is_result = is_from_gsmerge(ply.info.comments)
+    is_own = is_from_gsmerge(ply.info.comments)
     expected = read_expected_scores(ply.info.comments)
     facts: dict[str, Any] = {
         "cameras": files.cameras and str(files.cameras),
         "images": files.images and str(files.images),
-        "exporter": _OWN if is_result else "not known before the cameras fit",
+        "exporter": _OWN if is_own else "not known before the cameras fit",
         **note_entries(file_notes(ply.info)),
         **dict.fromkeys(("num_views", "width", "height", "num_missing", "num_sky_views"), 0),
         **dict.fromkeys(_UNKNOWN_KEYS),
         "coverage": [],
         "new_views": None if expected is None else asdict(expected),
+        "is_result": RESULT_COMMENT in ply.info.comments,
     }
     load = attempt(finish, find_views(ply, files, hints))
     facts["candidates"] = [asdict(choice) for choice in load.candidates]
@@ -151,7 +152,7 @@ def _describe_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> d
             facts |= {"num_views": len(camera_file), "camera_format": camera_file.source}
         return facts | {"alignment_problem": str(load)}
     facts |= {name: (path := getattr(load.files, name)) and str(path) for name in ("cameras", "images")}
-    facts |= _describe_scene(load, is_result=is_result)
+    facts |= _describe_scene(load, is_own=is_own)
     if load.recovery is None or load.alignment is None:
         return facts | {"alignment_problem": load.problem}
     return facts | {
@@ -163,10 +164,10 @@ def _describe_views(ply: GaussianFile, files: SceneFiles, hints: ReadHints) -> d
     }
 
 
-def _describe_scene(load: Loaded, *, is_result: bool) -> dict[str, Any]:
+def _describe_scene(load: Loaded, *, is_own: bool) -> dict[str, Any]:
     """Describe a scene that was read: its views, and the result that ``compact`` would make.
 
-    ``is_result`` is True for results of gsmerge, which have no exporter but perhaps unseen Gaussians.
+    ``is_own`` is True for files of gsmerge, which have no exporter but perhaps unseen Gaussians.
     """
     scene = load.scene
     distinct = without_repeats(scene)[0]  # each view once, as in a run
@@ -202,7 +203,7 @@ def _describe_scene(load: Loaded, *, is_result: bool) -> dict[str, Any]:
         sight = check_cameras(gaussians, np.ones(len(gaussians), bool), scene.cameras, images)
         means = gaussians.means[np.isfinite(gaussians.means).all(1)]
         facts |= {"sight": asdict(sight), "num_sky_views": len(sky_regions(means, scene.cameras, images))}
-    if not is_result:
+    if not is_own:
         is_known = load.recovery is not None or any(exporter.is_marked for exporter in load.exporters)
         titles = join_words(model.title for exporter in load.exporters for model in exporter.models)
         facts["exporter"] = (is_known and titles) or f"not known: {load.info.layout}"
@@ -266,7 +267,10 @@ def inspection_lines(scene: Mapping[str, Any]) -> list[str]:
         gain = f"about {new['after'] - new['before']:+.1f} dB against its input"
         lines += [f"new views  {gain}, which shows them at {new['before']:.1f} dB"]
     run = scene["compact"]
-    lines += ["compact    would refuse the scene as it is"] if run is None else estimate_lines(run)
+    if scene["is_result"]:
+        lines += ["compact    not needed: the file is a result of gsmerge; compact its source for another number"]
+    else:
+        lines += ["compact    would refuse the scene as it is"] if run is None else estimate_lines(run)
     if auto := scene["auto"]:
         share = f"{100 * auto['share']:.3g} %, {auto['num_gaussians']:,} Gaussians"
         lines += [f"auto       --budget auto takes {share}: {auto['why']}"]
@@ -275,9 +279,11 @@ def inspection_lines(scene: Mapping[str, Any]) -> list[str]:
 
 def _describe_images(scene: Mapping[str, Any]) -> str:
     """Describe where the photos are, and whether they are used."""
-    photos = [one["chosen"] for one in scene["candidates"] if one["kind"] == "photos"]
-    left_out = ", left out" if photos and not any(photos) else ""
-    return f"{scene['images']}{left_out}" if scene["images"] else "none found"
+    photos = [one for one in scene["candidates"] if one["kind"] == "photos"]
+    chosen = next((str(one["path"]) for one in photos if one["chosen"]), None)
+    if chosen is None and photos and scene["images"]:
+        return f"{scene['images']}, left out"
+    return scene["images"] or chosen or "none found"
 
 
 def _candidate_lines(candidates: Sequence[Mapping[str, Any]]) -> list[str]:

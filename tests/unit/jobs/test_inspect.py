@@ -13,7 +13,8 @@ from messages import names, noted
 from tiny_scene import Tiny, write_colmap_text, write_images, write_npz
 
 from gsmerge import CompactOptions, compact, read_scene
-from gsmerge.io import read_ply, write_ply
+from gsmerge.io import read_ply, write_gaussians, write_ply
+from gsmerge.io.formats.rows import RESULT_COMMENT
 from gsmerge.jobs.estimate import estimate
 from gsmerge.jobs.inspect import inspect, inspection_lines
 from gsmerge.prepare.prepare_scene import views_notes
@@ -292,7 +293,20 @@ def test_lines_of_a_scene_without_cameras_name_the_remedy(tmp_path: Path) -> Non
 def test_files_of_gsmerge_are_named_as_such(tmp_path: Path) -> None:
     save_export(tmp_path, SMOOTH, export_rows(SMOOTH))
     write_ply(tmp_path / "own.ply", read_ply(tmp_path / "scene.ply").gaussians[::7])
-    assert lines_by_word(tmp_path / "own.ply")["exporter"] == "gsmerge"
+    own = lines_by_word(tmp_path / "own.ply")
+    assert own["exporter"] == "gsmerge"
+    assert "not needed" not in own["compact"]  # a converted scene may well be compacted
+    write_gaussians(tmp_path / "own.ply", SMOOTH.gaussians[::7], comments=[RESULT_COMMENT], overwrite=True)
+    assert names(lines_by_word(tmp_path / "own.ply")["compact"], "not needed", "result of gsmerge")
+
+
+def test_photos_inside_other_files_are_named(tmp_path: Path, tiny: Tiny) -> None:
+    save_export(tmp_path, tiny, export_rows(tiny), cameras=False)
+    write_npz(tmp_path / "results.npz", tiny)
+    document = inspect(tmp_path)
+    photos = next(one["path"] for one in document["candidates"] if one["kind"] == "photos")
+    lines = inspection_lines(document | {"images": None})  # as where no folder of photos was found
+    assert f"images     {photos}" in lines
 
 
 def test_a_repeated_view_counts_once_in_the_estimate() -> None:
