@@ -256,7 +256,9 @@ class CountSearch:
         compact_share = 0.5  # a scene is compact already if the result needs more than this share of its Gaussians
         if count > compact_share * limits.num_input:
             return [f"the scene is compact already: {kept}, since fewer would {miss}"]
-        return [f"{kept}, about the fewest that {reach}"]
+        fewer = 10  # percent
+        hint = f"; --budget {fewer}% keeps fewer" if 100 * count > 2 * fewer * limits.num_input else ""
+        return [f"{kept}, about the fewest that {reach}{hint}"]
 
 
 def add_target(plan: Plan, prepared: Prepared) -> Plan:

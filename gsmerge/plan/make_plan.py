@@ -74,6 +74,15 @@ def make_plan(
         if plan.count.keeps_fidelity and has_few_rows(size):
             few = f"the scene has only {size.num_gaussians:,} Gaussians, fewer than its photos need"
             note(f"{few}; the result has at most half of them, and more may show the photos better: --budget NUMBER")
+        limits = plan.count.limits
+        usual = limits.default
+        num_superpixels = round(limits.per_view * size.num_views * plan.merge.superpixels.start_share)
+        merging = 2  # about half of the superpixels are merged into those of other views
+        if options.scene_decides and size.has_own_pixels and num_superpixels > merging * usual:
+            share = f"{100 * usual / size.num_gaussians:.2g}%"
+            times = f"{limits.num_pixels / size.num_gaussians:.2g} times as many pixels as the file has Gaussians"
+            why = f"the photos have {times}, and their superpixels show more of them"
+            note(f"the result may have more than {share} of the input, because {why}; --budget {share} keeps to it")
         return replace(
             plan,
             count=replace(plan.count, file_size=file_size(options.budget, size.sh_degree)),

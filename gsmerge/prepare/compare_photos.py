@@ -303,6 +303,16 @@ def _describe_hidden(scene: PicturedScene, hidden: np.ndarray, views: Sequence[i
     )
 
 
+def row_spacing(with_row: np.ndarray) -> int:
+    """Return the distance in pixels of the pixels ``[v,h,w]`` that have a row.
+
+    Beside photos that are larger than those a model saw, only some pixels have a row, with the mean colour of the
+    pixels around it.
+    """
+    beside = (with_row[..., 1:] & with_row[..., :-1]).sum()
+    return round(float(np.sqrt(with_row.size / max(1, with_row.sum())))) if 2 * beside < with_row.sum() else 1
+
+
 def _find_hidden(scene: PicturedScene, changes: Sequence[PhotoChange]) -> tuple[np.ndarray, np.ndarray]:
     """Find the pixels ``[v,h,w]`` at which something covers the scene in its changed photos.
 
@@ -334,10 +344,7 @@ def _find_hidden(scene: PicturedScene, changes: Sequence[PhotoChange]) -> tuple[
     pictures, pixels = row_pictures(scene), scene.get_pixels()
     shown = pixels.shown
     with_row = shown & (scene.gaussians.opacities[pixels.fronts] > COMPARED_OPACITY) & inside
-    # Beside photos that are larger than those a model saw, only some pixels have a row, with the mean colour of the
-    # pixels around it
-    beside = (with_row[..., 1:] & with_row[..., :-1]).sum()
-    spacing = round(float(np.sqrt(with_row.size / max(1, with_row.sum())))) if 2 * beside < with_row.sum() else 1
+    spacing = row_spacing(with_row)
     footprint, window = (np.full(side | 1, 1 / (side | 1), np.float32) for side in (spacing, MEAN_PIXELS * spacing))
     hidden = np.stack(parallel_map(lambda view: differ(view, pictures[view], with_row[view]), range(len(scene))))
     picture_rows(scene, compare_drawn, np.asarray((hidden | ~inside).any((1, 2))))

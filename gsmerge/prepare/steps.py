@@ -261,12 +261,16 @@ def fill_scene(p: Prepared, options: PrepareOptions) -> Prepared:
     scene = draw_left_out(replace(filled, depths=None), masks)
     count = len(scene.gaussians) - len(p.scene.gaussians)
     added = f"{count_words(count, 'Gaussian')} added at pixels that no Gaussian covered enough" if count else ""
+    if count and (p.scene.get_pixels().fronts[:, [0, -1]] < 0).all():
+        added += ", which is usual: the model left the borders of its pictures out, and perhaps the sky"
     drawn = ""
     if scene.images is not p.scene.images:
         is_drawn = np.stack([(a != b).any(-1) for a, b in zip(p.scene.images, scene.images, strict=True)])
-        where = f"{is_drawn.any((1, 2)).sum()} of {len(scene)} pictures, where photos do not count"
         if is_drawn.any():
-            drawn = f"the Gaussians, or nothing, drawn in {where} ({100 * is_drawn.mean():.1f} % of all pixels)"
+            where = (
+                f"{is_drawn.any((1, 2)).sum()} of {len(scene)} pictures ({100 * is_drawn.mean():.1f} % of all pixels)"
+            )
+            drawn = f"where a photo does not count, its picture shows what the Gaussians show: in {where}"
     return p.after(added, drawn, scene=scene)
 
 

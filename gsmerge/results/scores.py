@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+import cv2
 import numpy as np
 
 from gsmerge.frozen import dataclass, replace
@@ -14,6 +15,7 @@ from gsmerge.method.geometry.views import scored_views
 from gsmerge.method.pipelines.plan import ScorePlan
 from gsmerge.method.raster.photos import NEAR_PLANE, WHOLE_SHARE, PhotoScore, scene_photos, score_photos
 from gsmerge.method.stages.prune import ROUNDING
+from gsmerge.prepare.compare_photos import row_spacing
 from gsmerge.results.report import Covered, PhotoFiles
 from gsmerge.runtime.record import stage
 from gsmerge.types import Gaussians, Scene
@@ -71,14 +73,21 @@ def measure_result(
 def measure_input(prepared: Prepared, plan: ScorePlan) -> PhotoScore | None:
     """Score the Gaussians of the input on the scored photos, and over the pixels that they cover; None without photos.
 
-    If each Gaussian comes from one view, the covered pixels are the pixels that have a Gaussian.
+    If each Gaussian comes from one view, the covered pixels are the pixels that have a Gaussian and, in photos larger
+    than those that the model saw, the pixels around them.
     """
     if not prepared.reference.of_views:
         return None
     views = prepared.input_scene
     if prepared.scene.empty is not None:  # where a result may show nothing, the input is not scored either
         views = replace(views, masks=prepared.result_views().masks)
-    covered = None if views.covered is None else list(views.covered[list(plan.views)])
+    covered = None
+    if views.covered is not None:
+        covered = list(views.covered[list(plan.views)])
+        spacing = row_spacing(views.covered)
+        if spacing > 1:
+            cell = np.ones((spacing, spacing), np.uint8)
+            covered = [cv2.dilate(mask.astype(np.uint8), cell) > 0 for mask in covered]
     return _score_photos("input", views.file_gaussians, views=views, prepared=prepared, plan=plan, covered=covered)
 
 

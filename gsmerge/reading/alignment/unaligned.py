@@ -69,7 +69,7 @@ _SHIFT_STEPS = [(2000 if i < 5 else 20_000, 8 if i < 5 else 1, 0.05 * 0.6**i) fo
 
 
 MIRRORED = "photos that show the Gaussians as in a mirror"
-UNMIRROR = "flip an axis of the Gaussians back, or export them without the flip"
+UNMIRROR = "export the Gaussians without the flip of an axis; no option of gsmerge mirrors a scene"
 
 
 @dataclass(frozen=True)

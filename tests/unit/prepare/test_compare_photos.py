@@ -292,3 +292,6 @@ def test_photos_that_are_larger_and_sharper_than_those_of_the_model_show_the_sce
     assert views == (0, 1, 2, 3)
     assert not any(changes)
     np.testing.assert_array_equal(scene.images, images)
+    report = compact(sparse, effort="draft").report
+    assert report.covered is None  # the pixels around a row are covered as well
+    assert noted(report.notes, "9 times as many pixels", "--budget 4.4%")

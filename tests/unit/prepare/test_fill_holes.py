@@ -169,7 +169,8 @@ def test_dropped_pixels_are_filled_where_cameras_are_known(tmp_path: Path, photo
     assert np.array_equal(np.flatnonzero(scene.pixels.shown.reshape(-1)), da3_rows(tiny))
     prepared = prepare(scene)
     added = len(prepared.scene.gaussians) - len(scene.gaussians)
-    assert noted(prepared.changes, f"{added} Gaussians added at pixels that no Gaussian covered")
+    usual = "which is usual"  # Depth Anything 3 leaves out the borders of all views
+    assert noted(prepared.changes, f"{added} Gaussians added at pixels that no Gaussian covered", usual)
     alphas = render(prepared.scene.gaussians, prepared.scene.cameras).alphas
     assert (alphas > 0.5).mean() > 0.99
     assert np.array_equal(prepared.input_scene.pixels.shown, scene.pixels.shown)
