@@ -72,7 +72,7 @@ def parse(call: str) -> None:
     name, rest = " ".join(words[:number]), words[number:]
     if name in ("", "--help", "--version", "COMMAND") or rest == ["--set", "help"]:
         return
-    if name not in COMMANDS and Path(name).suffix in (".ply", ".gsm"):
+    if name not in COMMANDS and (Path(name).suffix in (".ply", ".gsm") or name.endswith("/")):
         name, rest = "compact", words
     COMMANDS[name].make_context(name, rest)
 

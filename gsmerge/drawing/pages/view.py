@@ -98,11 +98,11 @@ def view(
         >>> page.save("demo/small.html", overwrite=True).name
         'small.html'
     """
-    if results is None and hasattr(scene, "show"):
-        page: Page = scene.show()
+    given: Any = scene
+    if results is None and hasattr(given, "show"):
+        page: Page = given.show()
         return page
     with record_run(progress):
-        given = scene if isinstance(scene, Scene | str | PathLike) else own_gaussians(scene)
         input_scene = as_scene(given).numpy()
         shown_scene = add_views(input_scene, shown=True)  # viewpoints are placed for a scene without views
     named = results if isinstance(results, Mapping) else {"result": results}
