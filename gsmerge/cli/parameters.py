@@ -11,7 +11,7 @@ import os
 import re
 import shutil
 import textwrap
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
@@ -93,14 +93,15 @@ def read_settings(kinds: Sequence[Kind], pairs: Iterable[str] | None = None, **t
     return Given({name: settings[name].parse(text) for name, text in typed.items()}, labels)
 
 
-def split_pairs(flag: str, pairs: Iterable[str], known: Collection[str]) -> dict[str, str]:
+def split_pairs(flag: str, pairs: Iterable[str], known: Mapping[str, Setting]) -> dict[str, str]:
     """Split NAME=VALUE pairs of ``--set`` or ``--hint``; UsageError for a name that is not known or is repeated."""
     texts: dict[str, str] = {}
     for pair in pairs:
         name, sign, text = pair.partition("=")
         name = name.strip().replace("-", "_")
         if not sign:
-            raise UsageError(f"{flag}: expected NAME=VALUE, got {pair!r}")
+            values = f"; {name} is {known[name].values()}" if name in known else ""
+            raise UsageError(f"{flag}: expected NAME=VALUE, got {pair!r}{values}")
         if name not in known:
             remedy = f"{flag} {LIST_SETTINGS} lists all" if flag == "--set" else f"expected {join_words(known)}"
             raise UsageError(f"{flag} {name}: unknown{suggest_name(name, known)}; {remedy}")

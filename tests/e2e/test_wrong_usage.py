@@ -60,6 +60,7 @@ USAGE = {
     "compact room --set pose=free": "--set pose*unknown*poses*--set help",
     "compact room --set overlap=much": "--set overlap*'much'",
     "compact room --k 2 --set k=2": "--set k*--k too",
+    "compact room --set look": "--set*NAME=VALUE*'look'*auto, scene or photos",
     "compact room --hint oder=none": "--hint oder*unknown*order",
     "compact room --threads 0": "--threads*1",
     "compact room --budget 5B": "budget*579*5",
