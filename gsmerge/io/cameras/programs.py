@@ -151,7 +151,8 @@ def move_to_gaussians(source: CameraSource, views: list[StoredView]) -> list[Sto
     if not ids:
         return views
     selected = [views[i] for i in ids]
-    poses = np.array([view.pose for view in selected]).reshape(-1, 4, 4)
+    with number_errors(source.path, "expected poses of 4x4 numbers"):
+        poses = np.array([view.pose for view in selected]).reshape(-1, 4, 4)
     with np.errstate(all="ignore"):  # the check of the cameras refuses overflows
         poses = mean_pose_frame(poses).move_viewmats(poses)
     return [view._replace(pose=pose) for view, pose in zip(selected, poses, strict=True)]
