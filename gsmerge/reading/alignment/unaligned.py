@@ -320,19 +320,20 @@ def _choose_frame(inputs: AlignmentInput, usual: CameraCheck, stated: Sequence[S
     stands_out = _stands_out(inputs, best, score)
     # views without a photo are black and do not count; one photo is too few, because it fits somewhere in any scene
     has_photos = inputs.scale is None and inputs.images.any((1, 2, 3)).sum() > 1
-    is_sure = not has_photos  # of all frames
+    is_moved = not usual.ok  # or no shift is searched
     if has_photos and not (stands_out and _fits_exactly(inputs, best)):
         measure = partial(_measure_foremost, inputs)
         found, is_sure = find_frame(inputs, measure, partial(_fits_exactly, inputs))
+        is_moved &= not is_sure
         if found is not None:  # about right; a frame without its errors is chosen if that explains the photos as well
             found_score = _score_frame(inputs, found)
             if found_score > _PEAK_GAIN * score or not stands_out:
                 best, score = found, found_score
             stands_out = True
-    if not (stands_out or is_sure):
+    if has_photos and not stands_out:
         # frames of `exporter_frames`: rotated into the first camera, turned to y up, and moved into the first camera
         solved = [_solve_scale(inputs, frame) for frame in (IDENTITY, frames[1], frames[4], frames[-1])]
-        best, score = _best_frame(inputs, [best, *solved, *([] if usual.ok else _solve_shift(inputs))])
+        best, score = _best_frame(inputs, [best, *solved, *(_solve_shift(inputs) if is_moved else [])])
         stands_out = _stands_out(inputs, best, score)
     if best is IDENTITY or not stands_out:
         return None

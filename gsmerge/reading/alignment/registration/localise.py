@@ -47,8 +47,6 @@ DRAWN_PIXELS = 480  # longer side of drawings, and of the photos that are compar
 LEAST_PARALLAX = 0.01  # radians between the rays of a keypoint in two photos, from which its depth is known
 MOST_ERROR = 0.006  # distance of a triangulated point from its keypoints, in diagonals of the picture
 NEAREST, FARTHEST = 1e-3, 1e4  # planes of drawings, in median distances of the Gaussians from their middle
-# Matches of a keypoint of a drawing in a photo: .06 to .2 where most photos show the Gaussians, else .003 to .022
-WRONG_MATCHES = 0.02
 # Colours of Gaussians in a frame of matched keypoints, in distances of wrong pairs: .3 to .85, or if wrong about 1
 WRONG_COLORS = 0.93
 ABOUT_EQUAL = 0.9  # cosine of 26 degrees between two cameras, up to which keypoints match well
@@ -73,8 +71,8 @@ def find_frame(
     that repeat match at wrong places, too: of matches whose colours, which ``measure`` compares with those of wrong
     pairs, are no better than these, nothing is refined, and a frame has to fit as ``fits`` says.
 
-    Returns the frame, or None, and whether photos and drawings have so many keypoints that there is no other frame:
-    all of them move the cameras together, so photos that do not agree with each other show the Gaussians in none.
+    Returns the frame, or None, and whether photos and drawings have so many keypoints that a shift would have been
+    found: it changes what cameras see less than another scale does.
     """
     views = [view for view in range(len(inputs.cameras)) if inputs.images[view].any()]
     views = [views[i] for i in even_views(len(views), min(len(views), MOST_PHOTOS))]
@@ -92,8 +90,7 @@ def find_frame(
         drawings = _draw_keypoints(gaussians, viewpoints)
         count = sum(len(drawing.points) for drawing in drawings)
         num_drawn = max(num_drawn, count)
-        matches = match_photos((0, 1), photos, drawings, (cameras.width, cameras.height))
-        link = connect(matches) if len(matches) > WRONG_MATCHES * count * len(photos) else None
+        link = connect(match_photos((0, 1), photos, drawings, (cameras.width, cameras.height)))
         if link is None or measure(link[0]) > WRONG_COLORS:
             continue
         frame = min((link[0], _register_colors(images, gaussians, link[0], cameras)), key=measure)
