@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from itertools import chain, product
 from pathlib import Path
@@ -16,6 +16,8 @@ from gsmerge.method.geometry.transforms import (
     IDENTITY,
     Similarity,
     is_inside,
+    median,
+    medians,
     motion_matrices,
     project_points,
     sh0_to_rgb,
@@ -23,7 +25,7 @@ from gsmerge.method.geometry.transforms import (
 from gsmerge.method.kernels.elementary import exp
 from gsmerge.method.kernels.matrices import invert, matmul
 from gsmerge.reading.alignment.conventions import PosesInConvention, other_conventions
-from gsmerge.reading.alignment.frames import axis_turns, exporter_frames
+from gsmerge.reading.alignment.frames import axis_turns, describe_frame, exporter_frames
 from gsmerge.reading.alignment.grids import Grid, with_poses
 from gsmerge.reading.alignment.registration.localise import find_frame, mirror
 from gsmerge.reading.alignment.registration.register import compose
@@ -279,7 +281,10 @@ def is_mirrored(inputs: AlignmentInput) -> bool:
     if inputs.images.any((1, 2, 3)).sum() < 2 or _fits_exactly(inputs, IDENTITY):
         return False
     mirrored = mirror(inputs)
-    return any(_fits_exactly(mirrored, frame) for frame in (IDENTITY, *axis_turns()))
+    frames = (IDENTITY, *axis_turns())
+    # a frame in which the views see nothing contradicts no photo
+    seen = (frame for frame in frames if np.isfinite(_measure_foremost(mirrored, frame)))
+    return any(_fits_exactly(mirrored, frame) for frame in seen)
 
 
 def _check_colors(inputs: AlignmentInput, cameras: Cameras, name: str, no_pixels: SceneError) -> None:
@@ -326,6 +331,7 @@ def _choose_frame(inputs: AlignmentInput, usual: CameraCheck, stated: Sequence[S
         found, is_sure = find_frame(inputs, measure, partial(_fits_exactly, inputs))
         is_moved &= not is_sure
         if found is not None:  # about right; a frame without its errors is chosen if that explains the photos as well
+            found = refine_frame(inputs, found, measure)
             found_score = _score_frame(inputs, found)
             if found_score > _PEAK_GAIN * score or not stands_out:
                 best, score = found, found_score
@@ -339,6 +345,37 @@ def _choose_frame(inputs: AlignmentInput, usual: CameraCheck, stated: Sequence[S
         return None
     usual_score = max(_score_frame(inputs, IDENTITY), usual.score if usual.ok else 0.0)
     return best if score > _FRAME_GAIN * usual_score else None
+
+
+def refine_frame(inputs: AlignmentInput, frame: Similarity, measure: Callable[[Similarity], float]) -> Similarity:
+    """Turn, move and scale a frame about the middle of the Gaussians until ``measure`` gains nothing.
+
+    Small pictures have few keypoints, and a frame of these is wrong by half a degree, which is a pixel.
+    """
+    points = inputs.gaussians.means[inputs.valid].astype(np.float64)
+    middle = medians(points)
+    unit = median(np.sqrt(((points - middle) ** 2).sum(1)))
+
+    def move(step: np.ndarray) -> Similarity:
+        """Return the frame after a turn, a shift and a change of the scale ``[7]``, in hundredths."""
+        rotation = motion_matrices(np.concatenate([step[:3], np.zeros(3)])[None] / 100)[0, :3, :3]
+        scale = float(exp(step[6:] / 100)[0])
+        shift = middle - scale * matmul(middle[None], rotation.T)[0] + step[3:6] * unit / 100
+        return compose(Similarity(rotation, scale, shift), frame)
+
+    best = measure(frame)
+    place = np.zeros(7)
+    size = 1.0 if best > _SURE_RATIO else 0.0
+    while size > 1 / 16:  # half a pixel of small pictures
+        steps = (place + sign * size * axis for axis in np.eye(7) for sign in (1, -1))
+        costs = [(measure(move(step)), step) for step in steps]
+        least, step = min(costs, key=lambda cost: cost[0])
+        if least < best:
+            best = least
+            place = step
+        else:
+            size /= 2
+    return describe_frame(move(place)) if place.any() else frame
 
 
 def _fits_exactly(inputs: AlignmentInput, frame: Similarity) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
@@ -14,7 +15,7 @@ from gsmerge import Cameras, Scene
 from gsmerge.method.geometry.transforms import Similarity
 from gsmerge.reading.alignment.registration.localise import find_frame
 from gsmerge.reading.alignment.score import AlignmentInput
-from gsmerge.reading.alignment.unaligned import check_cameras, is_mirrored
+from gsmerge.reading.alignment.unaligned import check_cameras, is_mirrored, refine_frame
 
 WIDTH, HEIGHT = 160, 120
 
@@ -73,3 +74,27 @@ def test_a_mirrored_scene_is_named(room: Scene) -> None:
     assert is_mirrored(inputs_of(replace(room, gaussians=flipped), room.cameras))
     assert not is_mirrored(inputs_of(room, room.cameras))
     assert not is_mirrored(replace(inputs_of(room, room.cameras), images=np.zeros((0, HEIGHT, WIDTH, 3))))
+
+
+@pytest.mark.parametrize("change", [lambda p: 0.5 * p, lambda p: 0.3 * p**2.2, lambda p: 1 - p, lambda p: p[::-1]])
+def test_photos_that_look_otherwise_are_no_mirror(room: Scene, change: Callable[[np.ndarray], np.ndarray]) -> None:
+    """Turned cameras that see nothing contradict no photo, and are no frame of a mirrored scene."""
+    photos = change(np.asarray(room.images)).astype(np.float32)
+    assert not is_mirrored(inputs_of(replace(room, images=photos), room.cameras))
+
+
+def test_a_frame_of_few_keypoints_is_refined() -> None:
+    """Keypoints of small pictures find a frame that is wrong by a degree or more."""
+    ball = scenes.ball((0.1, 0.05, 2.4), 0.4, scenes.waves(1, rate=40.0))
+    room = scenes.make_scene([ball, scenes.plane(3.0, scenes.waves(0, rate=40.0))], scenes.arc(4, WIDTH, HEIGHT))
+    middle = np.median(room.gaussians.means, 0)
+    turn = rotation(*np.deg2rad([0.6, -0.5, 0.3]))
+    world = Similarity(turn, 1.008, middle - 1.008 * turn @ middle + [0.004, 0, -0.01])
+    inputs = inputs_of(room, world.move_cameras(room.cameras))
+    rough = Similarity(np.eye(3), 1.0, np.zeros(3))
+    frame = refine_frame(inputs, rough, partial(measure, inputs))
+    errors = [np.abs(one.move_cameras(inputs.cameras).viewmats - room.cameras.viewmats).max() for one in (rough, frame)]
+    assert errors[0] > 0.02
+    assert errors[1] < errors[0] / 3
+    true = Similarity(turn.T, 1 / 1.008, -turn.T @ world.shift / 1.008)
+    assert refine_frame(inputs, true, partial(measure, inputs)) is true  # it explains the photos as it is
