@@ -47,8 +47,8 @@ def render(
         background: Colour behind the Gaussians, 1 or 3 numbers.
         antialiased: Lower the opacity of small Gaussians to compensate for the dilation; None: as ``cameras`` say,
             which have the mark of a scene's file.
-        near: Nearest depth drawn, world units, above 0; None: about a hundredth of the median depth in the views, as in
-            ``compact`` and ``evaluate``.
+        near: Nearest depth drawn, world units, above 0; None: 0.01, or in a small scene about a hundredth of the median
+            depth in the views.
         far: Farthest depth drawn.
         with_depths: Also render the mean depth.
 
@@ -63,7 +63,7 @@ def render(
         >>> gsmerge.render(scene.gaussians, scene.cameras, background=1.0).images.shape
         (5, 32, 48, 3)
     """
-    near = near_plane(gaussians, cameras) if near is None else near
+    near = min(0.01, near_plane(gaussians, cameras)) if near is None else near
     for doubt in doubt_empty(gaussians, cameras, near, [f"picture {view}" for view in range(len(cameras))]):
         warnings.warn(doubt, DoubtWarning, stacklevel=3)  # the caller: above this function and its decorator
     return render_at(

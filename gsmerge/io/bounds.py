@@ -105,7 +105,7 @@ def check_file(path: Path) -> int:
     try:
         status = os.stat(path)
     except FileNotFoundError as error:
-        raise no_such_path(path, "no such file") from error
+        raise no_such_path(path) from error
     except (OSError, ValueError) as error:
         raise SceneError(path, f"cannot be read ({getattr(error, 'strerror', error)})") from error
     if stat.S_ISDIR(status.st_mode):

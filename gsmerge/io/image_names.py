@@ -244,6 +244,8 @@ def mark_drawn(data: bytes) -> bytes:
 
 def is_drawn(picture: Path) -> bool:
     """Return whether the first or last bytes of a picture show that gsmerge drew it; False if it cannot be read."""
+    if not picture.is_file():  # a pipe would wait for a writer
+        return False
     with suppress(OSError), picture.open("rb") as file:
         if _DRAWN in file.read(_PNG_START + len("size") + len("tEXt") + len(_DRAWN)):
             return True

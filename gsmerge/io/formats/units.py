@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from gsmerge.errors import Doubt, SceneError
+from gsmerge.errors import SceneError
 from gsmerge.frozen import dataclass, replace
 from gsmerge.io.formats import rows as arrays
 from gsmerge.method.geometry.transforms import median, quantiles, sh0_to_rgb
@@ -29,8 +29,8 @@ _LOG_NOTE = "scales are read as logarithms, since {:.3g} % are below 0, which no
 _RAW_NOTE = "opacities lie in [0, 1] and are read as such; if they are logits, use --hint opacity=logit"
 _LOGIT_NOTE = "opacities are read as logits, since they lie beyond [0, 1]; if they are not, export them as opacities"
 _NARROW_NOTE = (
-    "opacities lie in [-1, 1] with both signs, as neither logits nor opacities do; they are read as logits, so that all"
-    " are half transparent; --hint opacity=logit says that this is right, else export them as logits"
+    "opacities lie in [-1, 1] with both signs and are read as logits, so that all are half transparent; --hint"
+    " opacity=logit says that this is right, else export them as logits"
 )
 _SAMPLES = 20_000  # Gaussians whose scales and colours are judged
 RGB_NOTE = "f_dc_0 to f_dc_2 are read as {}, since {}; if they are harmonics, use --hint colors=sh"
@@ -109,7 +109,7 @@ def choose_opacities(
         return "raw", not is_open, "" if is_open else _RAW_NOTE
     is_narrow = len(finite) >= _MIN_JUDGED and np.count_nonzero(np.abs(finite) > 1) <= few
     if is_narrow and np.count_nonzero(finite < 0) > few:
-        return "logit", True, Doubt(_NARROW_NOTE)
+        return "logit", True, _NARROW_NOTE
     return "logit", True, _LOGIT_NOTE if is_open else ""
 
 
