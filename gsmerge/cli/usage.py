@@ -30,7 +30,15 @@ SYNONYMS = {
     **dict.fromkeys(("poses", "colmap"), "cameras"),
 }
 # Words that users try as commands for compact, and that do not resemble it
-COMPACT_SYNONYMS = {"compress", "reduce", "simplify", "optimize", "prune", "merge", "shrink"}
+COMMAND_SYNONYMS = {
+    **dict.fromkeys(("compress", "reduce", "simplify", "optimize", "prune", "merge", "shrink"), "compact"),
+    **dict.fromkeys(("info", "stats", "check"), "inspect"),
+    **dict.fromkeys(("show", "open", "preview"), "view"),
+    **dict.fromkeys(("measure", "compare", "score", "metrics"), "evaluate"),
+    "draw": "render",
+    "export": "convert",
+    "version": "--version",
+}
 # Typer does not export the base of its usage errors, but exports BadParameter, which derives from it
 UsageErrors: Any = typer.BadParameter.__mro__[2]
 
@@ -68,7 +76,8 @@ class Group(TyperGroup):
         from gsmerge.io.bounds import suggest_path
 
         names = self.list_commands(ctx)
-        hint = "; perhaps compact" if name.lower() in COMPACT_SYNONYMS else suggest_name(name, names)
+        synonym = COMMAND_SYNONYMS.get(name.lower())
+        hint = f"; perhaps {synonym}" if synonym else suggest_name(name, names)
         if not hint and ctx.parent is None:
             hint = f"; to compact a scene, name a file or folder that exists{suggest_path(name)}"
         raise UsageError(f"No such command '{name}'{hint}; see '{ctx.command_path} --help'")

@@ -68,7 +68,7 @@ def test_json_of_inspect_describes_sound_and_missing_files(sound: Path, run: Run
     first, second = document["files"]
     assert (first["kind"], first["count"], first["problems"]) == ("Gaussians", 1152, [])
     assert first["file_bytes"] == (sound / "scene.ply").stat().st_size
-    assert (second["kind"], second["problems"], document["num_wrong"]) == ("", ["no such file"], 1)
+    assert (second["kind"], second["problems"], document["num_wrong"]) == ("", ["no such file or folder"], 1)
     assert says(done.err.removeprefix(ERROR), tmp_path / "none.spz", "no such file", "1 of 2")
 
 

@@ -88,6 +88,7 @@ USAGE = {
     "room room": "room*twice*-o",
     "compacc room": "*'compacc'*perhaps compact",
     "compress room": "*'compress'*perhaps compact",
+    "info room": "*'info'*perhaps inspect",
     "roum": "*'roum'*name a file or folder that exists*perhaps room",
     "convert alone.ply spz": "spz*format*-o alone.spz",
     "compact room -o SOG": "SOG*format*-o scene.sog",
