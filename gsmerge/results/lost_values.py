@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from gsmerge.drawing.render_views import near_plane
 from gsmerge.errors import Doubt
 from gsmerge.frozen import replace
 from gsmerge.io.formats.table import FILES, Format, Held, output_format
@@ -65,6 +66,8 @@ def find_lost_values(gaussians: Gaussians, format_: Format) -> dict[str, np.ndar
     found = dict[str, np.ndarray]()
     for name, held in format_.values.items():
         values = getattr(gaussians, name).reshape(len(gaussians), -1)
+        if not values.size or (values.min() >= held.low and values.max() <= held.high):  # of most scenes
+            continue
         low = np.sort(values, axis=1)[:, 1:2] if name == "scales" else values
         tolerance = 0.5 * held.step  # rounding to the nearest number changes other values as much
         factor = 1 + tolerance
@@ -88,8 +91,9 @@ def _compare_pictures(gaussians: Gaussians, values: Mapping[str, Held], cameras:
         name: np.clip(getattr(gaussians, name), np.float32(held.low), np.float32(held.high))
         for name, held in values.items()
     }
-    before = render(gaussians, cameras).images.clip(0, 1)
-    after = render(replace(gaussians, **clipped), cameras).images.clip(0, 1)
+    near = near_plane(gaussians, cameras)
+    before = render(gaussians, cameras, near=near).images.clip(0, 1)
+    after = render(replace(gaussians, **clipped), cameras, near=near).images.clip(0, 1)
     return decibels(float(np.square(before - after, dtype=np.float64).mean()))
 
 

@@ -66,6 +66,16 @@ def test_a_sky_that_a_format_makes_smaller_is_noted(cameras: bool, wall: Scene) 
     assert noted(describe_lost_values("tileset.json", both, wall.cameras if cameras else NO_CAMERAS), "sizes above 379")
 
 
+def test_sizes_of_a_scene_in_a_small_unit_are_noted(wall: Scene) -> None:
+    """The near plane of the pictures follows the scene, or they would be empty and alike."""
+    unit = np.float32(1e-3)
+    small = replace(wall.gaussians, means=unit * wall.gaussians.means, scales=unit * wall.gaussians.scales)
+    viewmats = np.array(wall.cameras.viewmats)
+    viewmats[:, :3, 3] *= unit
+    (note,) = describe_lost_values("a.spz", small, replace(wall.cameras, viewmats=viewmats))
+    assert noted([note], "sizes below 4.5e-05")
+
+
 def test_what_no_picture_shows_is_not_noted(wall: Scene) -> None:
     """Flat Gaussians, values within half a step, and formats that hold everything."""
     flat = with_values(wall.gaussians, "scales", wall.gaussians.scales[:, 0])
