@@ -29,7 +29,7 @@ SYNONYMS = {
     **dict.fromkeys(("photos", "image-dir"), "images"),
     **dict.fromkeys(("poses", "colmap"), "cameras"),
 }
-# Words that users try as commands for compact, and that do not resemble it
+# Words that users try as commands, and what does this
 COMMAND_SYNONYMS = {
     **dict.fromkeys(("compress", "reduce", "simplify", "optimize", "prune", "merge", "shrink"), "compact"),
     **dict.fromkeys(("info", "stats", "check"), "inspect"),

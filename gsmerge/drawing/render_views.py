@@ -63,7 +63,7 @@ def render(
         >>> gsmerge.render(scene.gaussians, scene.cameras, background=1.0).images.shape
         (5, 32, 48, 3)
     """
-    near = min(0.01, near_plane(gaussians, cameras)) if near is None else near
+    near = min(NEAR_PLANE, near_plane(gaussians, cameras)) if near is None else near
     for doubt in doubt_empty(gaussians, cameras, near, [f"picture {view}" for view in range(len(cameras))]):
         warnings.warn(doubt, DoubtWarning, stacklevel=3)  # the caller: above this function and its decorator
     return render_at(

@@ -166,8 +166,7 @@ def _judge_scales(out: dict[str, np.ndarray]) -> tuple[bool, str]:
     ``scales`` are the scales that result if the stored numbers are read as logarithms. The stored numbers are judged
     linear if, as logarithms, they give Gaussians too large for the scene, but as sizes fit the scene. In addition, with
     scales as logarithms, either all Gaussians must be about equally large, or half of them must be larger than a
-    quarter of the scene's width. Also return a clause on why
-    scales are linear or seem too large, "" without one.
+    quarter of the scene's width. Also return a clause on why scales are linear or seem too large, "" without one.
     """
     valid = out["valid"]
     rows = range(len(valid)) if valid.all() else np.flatnonzero(valid)
