@@ -55,7 +55,7 @@ def leave_out_blurred(scene: PicturedScene) -> tuple[PicturedScene, np.ndarray |
     if len(views) < LEAST_VIEWS:
         return scene, None, ""
     quick = np.array([_measure_fine(scene.images[view]) for view in views])
-    if quick.min() > WHOLE * np.median(quick):
+    if quick.min() > WHOLE * median(quick):
         return scene, None, ""
     surfaces = collect_surfaces(scene)
     ratios = _measure_ratios(scene, views, surfaces)

@@ -11,7 +11,9 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from gsmerge.method.raster import render
+from gsmerge.method.raster import TiledView, render
+from gsmerge.method.raster.composite import composite
+from gsmerge.method.raster.images import tile_views, tiles_near
 from gsmerge.method.raster.photos import COVERED_TRANSMITTANCE, counting_pixels
 from gsmerge.prepare.fill_holes import find_bare, large_parts
 from gsmerge.prepare.photo_change import PhotoChange, change_large
@@ -82,9 +84,19 @@ def draw_left_out(scene: PicturedScene, masks: np.ndarray | None) -> PicturedSce
         return scene
     unit = measure_unit(scene)
     holes = np.zeros(counts.shape, bool) if scene.empty is None else scene.empty > 0
-    drawn = render(scene.gaussians, scene.cameras)
-    colors = drawn.images.clip(0, 1)
-    transmittance = 1 - drawn.alphas[..., 0]
+    outside = np.zeros(counts.shape, bool) if masks is None else ~masks
+    # in a view with a hole all is drawn, in others what lies near left-out pixels
+    drawn = [view for view in range(len(scene)) if outside[view].any() or holes[view].any()]
+    parts = {view: tiles_near(outside[view], 2 * HOLE * unit) for view in drawn if not holes[view].any()}
+    colors = np.zeros_like(scene.images)
+    transmittance = np.ones(counts.shape, np.float32)
+
+    def draw(view: int, tiled: TiledView) -> None:
+        """Draw a view of the input."""
+        colors[view], transmittance[view] = composite(tiled)
+
+    tile_views(scene, draw, drawn, parts)
+    colors = colors.clip(0, 1)
     bare = transmittance > COVERED_TRANSMITTANCE
     if scene.beyond is not None:  # nothing is known there
         bare &= ~scene.beyond
@@ -94,7 +106,7 @@ def draw_left_out(scene: PicturedScene, masks: np.ndarray | None) -> PicturedSce
         transmittance = np.zeros_like(transmittance)
         solid = ~find_bare(scene)
     for view, hole in enumerate(holes):
-        left_out = np.zeros(hole.shape, bool) if masks is None else ~masks[view]
+        left_out = outside[view]
         nothing = _grow(~_grow(~bare[view], HOLE * unit), HOLE * unit)
         cut = (hole | nothing if hole.any() else hole) & ~left_out
         counts[view] &= ~_grow(cut, RING * unit)

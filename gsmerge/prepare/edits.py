@@ -14,6 +14,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
+from gsmerge.arrays import distinct
 from gsmerge.method.compare.view_pictures import fit_size
 from gsmerge.method.geometry.transforms import camera_centres, camera_depths, project, sh0_to_rgb
 from gsmerge.method.kernels.pictures import convolve
@@ -148,7 +149,7 @@ def _find_moved(scene: PicturedScene, rows: np.ndarray) -> np.ndarray:
     centres = np.stack([pixels % width, pixels // width], 1) + 0.5
     least = max(2.0, MOVED * max(width, scene.cameras.height))  # in small pictures rounding counts
     moved = np.zeros(len(rows), bool)
-    for view in np.unique(homes):
+    for view in distinct(homes):
         ids = np.flatnonzero(homes == view)
         (places,), (depths,) = project(scene.gaussians.means[rows[ids]], scene.cameras[[view]])
         distances = np.abs(places - centres[ids]).max(-1)
@@ -168,7 +169,7 @@ def _move_homes(scene: PicturedScene) -> tuple[Pixels, np.ndarray]:
     left = np.zeros(fronts.shape, bool)
     left.reshape(-1)[homes[moved]] = True
     fronts[(fronts >= 0) & moved[fronts]] = -1
-    for view in np.unique(homes[moved] // scene.pixels_per_view):
+    for view in distinct(homes[moved] // scene.pixels_per_view):
         rows = np.flatnonzero(moved & (homes // scene.pixels_per_view == view))
         seen, places, depths = _look_up(means[rows], scene, view, scene.cameras.width, scene.cameras.height)
         nearest_last = np.flatnonzero(seen)

@@ -14,13 +14,13 @@ import numpy as np
 from gsmerge.frozen import dataclass, replace
 from gsmerge.method.geometry.gaps import fill_gaps
 from gsmerge.method.geometry.pixel_gaussians import NEW_SIZE_PIXELS, make_round_gaussians, pixel_rays
-from gsmerge.method.geometry.transforms import camera_depths, lies_inside, nearest_views
+from gsmerge.method.geometry.transforms import camera_depths, lies_inside, median, nearest_views, quantiles
 from gsmerge.method.kernels.matrices import matmul
 from gsmerge.method.kernels.pictures import blur
 from gsmerge.method.kernels.reproject import add_differences
 from gsmerge.method.raster import TiledView
 from gsmerge.method.raster.composite import blend_depths
-from gsmerge.method.raster.images import tile_views
+from gsmerge.method.raster.images import tile_pixels, tile_views, tiles_near
 from gsmerge.prepare.photo_change import PhotoChange, change_large
 from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import parallel_map
@@ -63,36 +63,40 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = Fa
     beyond = scene.beyond
     fillable = shown & (fronts < 0)  # pixels with a picture and without a Gaussian
     bare = find_bare(scene)
-    views = [
-        view
-        for view in range(len(scene))
-        if is_cropped or fillable[view].any() or (not everywhere and large_parts(bare[view]).any())
-    ]
+    has_empty = [is_cropped or (not everywhere and bool(large_parts(part).any())) for part in bare]
+    views = [view for view in range(len(scene)) if has_empty[view] or fillable[view].any()]
     if not views:
         return scene
     holes, empty, edges = np.zeros_like(fillable), np.zeros_like(fillable), dict[int, _Edges]()
     gap = 2 * round(GAP_WIDTH * max(shown.shape[1:]) / 2) + 1
+    # where each pixel has its own Gaussians, a view without an empty part needs to be drawn only around its holes
+    parts = {view: tiles_near(fillable[view], gap) for view in views if scene.has_own_pixels and not has_empty[view]}
 
     def find_holes(view: int, tiled: TiledView) -> None:
         """Mark a view's pixels that stay empty, other pixels that its drawing does not cover, and holes to fill."""
         depths, transmittance = blend_depths(tiled)
         covered = transmittance <= 1 - HOLE_OPACITY
-        if is_cropped or not everywhere:
-            empty[view] = _find_empty(1 - transmittance, shown[view], gap, is_cropped=is_cropped)
-        if beyond is not None:  # nothing is known there
-            empty[view] &= ~beyond[view]
-        bare[view] = ~covered & ~empty[view]
+        if view in parts:
+            bare[view] &= ~covered & tile_pixels(parts[view], *covered.shape)
+        else:
+            if is_cropped or not everywhere:
+                empty[view] = _find_empty(1 - transmittance, shown[view], gap, is_cropped=is_cropped)
+            if beyond is not None:  # nothing is known there
+                empty[view] &= ~beyond[view]
+            bare[view] = ~covered & ~empty[view]
         holes[view] = fillable[view] & bare[view]
         if empty[view].any():  # the edges of a scene that was cut out are no holes
             window = np.ones((gap, gap), np.uint8)
             holes[view] &= cv2.morphologyEx(covered.astype(np.uint8), cv2.MORPH_CLOSE, window) > 0
         if covered.any() and holes[view].any():
             beside = fill_gaps(depths[..., None], covered)[..., 0]
-            known = _fit_map(scene, view)
-            farthest = float(np.quantile(depths[covered], FARTHEST_QUANTILE))
-            edges[view] = _Edges(beside[holes[view]], farthest, None if known is None else known[holes[view]])
+            front_depths = _measure_fronts(scene, view)
+            known = _fit_map(scene, view, front_depths)
+            surfaces = front_depths[fronts[view] >= 0] if view in parts else depths[covered]
+            (farthest,) = quantiles(surfaces, [FARTHEST_QUANTILE]) if surfaces.size else (0.0,)
+            edges[view] = _Edges(beside[holes[view]], float(farthest), None if known is None else known[holes[view]])
 
-    tile_views(scene, find_holes, views)
+    tile_views(scene, find_holes, views, parts)
     if edges and np.count_nonzero(bare[views]) < MOST_EMPTY * np.count_nonzero(~empty[views]):
         ids = sorted(edges)
         added = Gaussians.concat(parallel_map(lambda view: _fill_view(scene, view, holes[view], edges[view]), ids))
@@ -156,25 +160,34 @@ class _Edges:
     known: np.ndarray | None = None  # [n] depth of each hole in the view's depth map, NaN without one
 
 
-def _fit_map(scene: PicturedScene, view: int) -> np.ndarray | None:
+def _measure_fronts(scene: PicturedScene, view: int) -> np.ndarray:
+    """Return the depth ``[h,w]`` of the Gaussian in front at each pixel of a view; NaN where there is none."""
+    fronts = scene.get_pixels().fronts[view]
+    depths = np.full(fronts.shape, np.nan)
+    has_front = fronts >= 0
+    means = scene.gaussians.means[fronts[has_front]].astype(np.float64)
+    depths[has_front] = camera_depths(means, scene.cameras.viewmats[view])
+    return depths
+
+
+def _fit_map(scene: PicturedScene, view: int, front_depths: np.ndarray) -> np.ndarray | None:
     """Bring a view's depth map to the unit of the scene; return ``[h,w]``, NaN where it has no depth.
 
-    None without a map, or if the map explains the depths of the view's Gaussians no better than one depth for all of
-    them does: it does not belong to the view.
+    None without a map, or if the map explains the ``front_depths [h,w]`` of the view's Gaussians no better than one
+    depth for all of them does: it does not belong to the view.
     """
     if scene.depths is None:
         return None
     known = scene.depths[view].astype(np.float64)
-    fronts = scene.get_pixels().fronts[view]
     known[~(np.isfinite(known) & (known > 0))] = np.nan
-    both = (fronts >= 0) & np.isfinite(known)
+    both = np.isfinite(front_depths) & np.isfinite(known)
     if not both.any():
         return None
-    depths = camera_depths(scene.gaussians.means[fronts[both]].astype(np.float64), scene.cameras.viewmats[view])
+    depths = front_depths[both]
     ratios = depths / known[both]
-    usual = np.median(depths)
-    unit = np.median(ratios)
-    explains = np.median(np.abs(ratios / unit - 1)) < np.median(np.abs(depths / usual - 1))
+    usual = median(depths)
+    unit = median(ratios)
+    explains = median(np.abs(ratios / unit - 1)) < median(np.abs(depths / usual - 1))
     return known * unit if explains else None
 
 
@@ -224,16 +237,29 @@ def _leave_empty(scene: PicturedScene, empty: np.ndarray) -> PicturedScene:
 
 
 def _fill_view(scene: PicturedScene, view: int, holes: np.ndarray, edges: _Edges) -> Gaussians:
-    """Make a Gaussian for each pixel of a view in the mask ``holes [h,w]``.
+    """Make a Gaussian for each pixel of a view in the mask ``holes [h,w]``, with the depth of the map if it has one."""
+    cameras = scene.cameras
+    rays = pixel_rays(holes, cameras.Ks[view], cameras.viewmats[view])
+    known = np.full(len(rays), np.nan) if edges.known is None else np.minimum(edges.known, edges.farthest * FACTORS[-1])
+    is_known = np.isfinite(known)
+    depths = known if is_known.all() else np.where(is_known, known, _search_depths(scene, view, holes, edges, rays))
+    size = NEW_SIZE_PIXELS / cameras.Ks[view, 0, 0]
+    colors = scene.images[view][holes]
+    num_higher = scene.gaussians.shN.shape[1]
+    return make_round_gaussians(
+        cameras.centres[view], rays, depths=depths, size=size, colors=colors, num_higher=num_higher
+    )
 
-    Where no depth is known, that is chosen at which the nearest other views show the same colour. Differences of
-    colours are averaged over neighbouring holes. If no other view sees the points of a ray, the depth of the surface
-    beside the hole is chosen.
+
+def _search_depths(scene: PicturedScene, view: int, holes: np.ndarray, edges: _Edges, rays: np.ndarray) -> np.ndarray:
+    """Choose for each hole, with ``rays [n,3]``, the depth at which the nearest other views show the same colour.
+
+    Differences of colours are averaged over neighbouring holes. If no other view sees the points of a ray, the depth of
+    the surface beside the hole is chosen.
     """
     cameras = scene.cameras
-    centres = scene.cameras.centres
-    eye = scene.cameras.centres[view]
-    rays = pixel_rays(holes, cameras.Ks[view], cameras.viewmats[view])
+    centres = cameras.centres
+    eye = centres[view]
     edge_depths = edges.beside.astype(np.float64)
     far_depths = edges.farthest * FACTORS[:, None]
     depths = np.concatenate([edge_depths[None], np.maximum(far_depths, edge_depths)])  # [d,n] candidates
@@ -259,10 +285,4 @@ def _fill_view(scene: PicturedScene, view: int, holes: np.ndarray, edges: _Edges
         cost = np.where(number > min_weight, total / np.maximum(number, min_weight), np.inf) + min_gain * step
         best_depths = np.where(cost < best_costs, depth, best_depths)
         best_costs = np.minimum(cost, best_costs)
-    if edges.known is not None:
-        farthest = edges.farthest * FACTORS[-1]
-        best_depths = np.where(np.isfinite(edges.known), np.minimum(edges.known, farthest), best_depths)
-    size = NEW_SIZE_PIXELS / cameras.Ks[view, 0, 0]
-    return make_round_gaussians(
-        eye, rays, depths=best_depths, size=size, colors=colors, num_higher=scene.gaussians.shN.shape[1]
-    )
+    return best_depths

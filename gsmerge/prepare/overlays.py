@@ -15,7 +15,7 @@ import numpy as np
 
 from gsmerge.frozen import dataclass, replace
 from gsmerge.method.compare.view_pictures import fit_size
-from gsmerge.method.geometry.transforms import project
+from gsmerge.method.geometry.transforms import median, medians, project
 from gsmerge.method.geometry.views import even_views, take_rows
 from gsmerge.method.kernels.pictures import blur, sample_bilinear, sobel
 from gsmerge.method.raster.photos import counting_pixels
@@ -100,9 +100,9 @@ def _grow_in_photos(scene: PicturedScene, part: np.ndarray) -> np.ndarray:
     views = scene.photo_views
     overlay = np.repeat(part[None], len(scene), 0)
     covered = scene.images[views][:, part]
-    usual = np.median(covered, 0)
+    usual = medians(covered)
     differences = np.abs(covered - usual).max(-1)
-    noise = float(np.median(differences))
+    noise = median(differences)
     if noise > OPAQUE:
         return overlay
     least = np.float32(noise + ROUNDING)
@@ -126,7 +126,7 @@ def find_overlay(scene: PicturedScene) -> np.ndarray | None:
     photos = np.stack([cv2.resize(scene.images[view], size, interpolation=cv2.INTER_AREA) for view in views])
     first = _vote(scene, views, photos, step=2, partners=QUICK_PARTNERS)
     slopes = np.stack([np.stack(sobel(photo.mean(-1)), -1) / 8 for photo in photos])
-    usual_slopes = np.median(slopes, 0)
+    usual_slopes = medians(slopes)
     near_edge = _grow(_find_edges(slopes, usual_slopes, first.noise), SMALL)
     if (first.seeds & near_edge[::2, ::2]).mean() < LEAST_SEEDS:
         return None
@@ -134,7 +134,7 @@ def find_overlay(scene: PicturedScene) -> np.ndarray | None:
     by_slope = _vote(scene, views, slopes, step=1, partners=PARTNERS)
     edges = _find_edges(slopes, usual_slopes, by_slope.noise)
     seeds = by_color.seeds | (by_slope.seeds & edges)
-    picture = np.median(photos, 0)
+    picture = medians(photos)
     is_constant = np.abs(photos - picture).mean(-1).mean(0) < by_color.noise / 2
     joined = seeds | is_constant | (edges & _grow(seeds, BESIDE))
     joined = cv2.morphologyEx(joined.astype(np.uint8), cv2.MORPH_CLOSE, SMALL)
@@ -151,8 +151,8 @@ def find_overlay(scene: PicturedScene) -> np.ndarray | None:
         eroded = cv2.erode(inside.astype(np.uint8), SMALL, borderType=cv2.BORDER_CONSTANT, borderValue=1)
         outline = inside & (eroded == 0)
         interior = inside & ~_grow(outline, BESIDE)
-        is_plain = not interior.any() or np.median(texture[interior]) < by_color.noise / 4
-        is_sky = is_plain and np.median(depths[inside]) > FAR
+        is_plain = not interior.any() or median(texture[interior]) < by_color.noise / 4
+        is_sky = is_plain and median(depths[inside]) > FAR
         is_outlined = outline.any() and min(near_edge[outline].mean(), near_seed[outline].mean()) >= OUTLINE
         if is_outlined and not is_sky and has_row[inside].mean() >= 1 - MOST_BARE:
             part |= inside
@@ -196,9 +196,10 @@ def _vote(scene: PicturedScene, views: Sequence[int], values: np.ndarray, *, ste
     row_errors = np.stack(by_rows)
     pixel_errors = np.stack(by_pixel)
     nothing = np.zeros(x.shape, bool)
-    if not told.any() or np.median(row_errors[told]) >= np.median(pixel_errors[told]):
+    usual_error = median(row_errors[told])
+    if not usual_error < median(pixel_errors[told]):
         return _Votes(nothing, nothing, 1.0)  # photos are too alike, or Gaussians too rough, to tell scene from overlay
-    noise = max(1 / 255, float(np.median(row_errors[told])) / 2)
+    noise = max(1 / 255, usual_error / 2)
     is_same = (told & (row_errors > BETTER * pixel_errors + noise)).sum(0)
     is_scene = (told & (pixel_errors > BETTER * row_errors + noise)).sum(0)
     num_told = told.sum(0)
@@ -238,10 +239,10 @@ def _describe_rows(scene: PicturedScene, views: Sequence[int], size: tuple[int, 
         (depth,) = project(scene.gaussians.means[np.maximum(fronts, 0)].reshape(-1, 3), scene.cameras[[view]])[1]
         has_row = fronts >= 0
         depth = depth.reshape(fronts.shape)
-        usual = np.median(depth[has_row]) if has_row.any() else 1.0
+        usual = median(depth[has_row]) if has_row.any() else 1.0
         shares.append(has_row)
         depths.append(np.where(has_row, depth / usual, 1))
-    return np.mean(shares, 0), np.median(depths, 0)
+    return np.mean(shares, 0), medians(np.stack(depths))
 
 
 def _describe_place(part: np.ndarray) -> str:

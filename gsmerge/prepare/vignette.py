@@ -15,7 +15,7 @@ import numpy as np
 from gsmerge.frozen import dataclass, replace
 from gsmerge.method.compare.similarity import stands_out
 from gsmerge.method.compare.view_pictures import fit_size
-from gsmerge.method.geometry.transforms import median, rgb_to_sh0, sh0_to_rgb
+from gsmerge.method.geometry.transforms import median, medians, rgb_to_sh0, sh0_to_rgb
 from gsmerge.method.geometry.views import even_views, take_rows
 from gsmerge.method.kernels.elementary import exp, log
 from gsmerge.method.kernels.matrices import solve
@@ -91,7 +91,8 @@ def divide_by_vignette(scene: PicturedScene) -> tuple[PicturedScene, np.ndarray 
     views = [views[i] for i in even_views(len(views), min(len(views), MOST_VIEWS))]
     size = fit_size((scene.cameras.width, scene.cameras.height), CELLS)
     small = np.stack([cv2.resize(scene.images[view].mean(-1), size, interpolation=cv2.INTER_AREA) for view in views])
-    is_dark = small < DARK * np.median(small, (1, 2), keepdims=True)
+    usual = medians(small.reshape(len(small), -1).T)[:, None, None]
+    is_dark = small < DARK * usual
     if is_dark.all(0).mean() < LEAST_SHARE:  # no place is dark in all photos, as in nearly all scenes
         return scene, None, ""
     light = _find_light(scene, views)

@@ -7,13 +7,14 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+import cv2
 import numpy as np
 
 from gsmerge.arrays import Array, like
 from gsmerge.method.kernels.raster.project import TILE
 from gsmerge.method.raster.composite import Rendering, background_color, blend, draw_views, prepare_views, view_colors
 from gsmerge.method.raster.photos import NEAR_PLANE
-from gsmerge.method.raster.tiled_view import FAR_PLANE, Splats, TiledView, make_splats, tile_view
+from gsmerge.method.raster.tiled_view import FAR_PLANE, Splats, TiledView, tile_view
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Cameras, Gaussians, Scene
 
@@ -122,19 +123,31 @@ def _make_tiler(
     return tile_one
 
 
-def tile_camera(splats: Splats, cameras: Cameras, view: int, near: float = NEAR_PLANE) -> TiledView:
-    """Tile the view of one camera, as its mark says that Gaussians are drawn."""
+def tile_camera(
+    splats: Splats, cameras: Cameras, view: int, near: float = NEAR_PLANE, tiles: np.ndarray | None = None
+) -> TiledView:
+    """Tile the view of one camera, as its mark says that Gaussians are drawn; ``tiles``: see :func:`tile_view`."""
     camera = cameras.viewmats[view].astype(np.float64), cameras.Ks[view].astype(np.float64)
-    return tile_view(splats, *camera, cameras.width, cameras.height, antialiased=cameras.antialiased, near=near)
+    return tile_view(
+        splats, *camera, cameras.width, cameras.height, antialiased=cameras.antialiased, near=near, tiles=tiles
+    )
 
 
-def tile_views(scene: Scene, use: Callable[[int, TiledView], None], views: Sequence[int] | None = None) -> None:
-    """Tile all views, or only ``views``, and call ``use(view, tiled)`` for each, in parallel if memory allows."""
-    splats = make_splats(scene.gaussians)
+def tile_views(
+    scene: Scene,
+    use: Callable[[int, TiledView], None],
+    views: Sequence[int] | None = None,
+    tiles: Mapping[int, np.ndarray] | None = None,
+) -> None:
+    """Tile all views, or only ``views``, and call ``use(view, tiled)`` for each, in parallel if memory allows.
+
+    ``tiles`` has masks of the tiles that have to be complete, see :func:`tile_view`; views without one are complete.
+    """
+    splats, *_ = prepare_views(scene.gaussians, scene.cameras)
 
     def tile_and_use(view: int) -> None:
         """Tile one view, and call ``use`` for it."""
-        use(view, tile_camera(splats, scene.cameras, view))
+        use(view, tile_camera(splats, scene.cameras, view, tiles=None if tiles is None else tiles.get(view)))
 
     view_ids = range(len(scene)) if views is None else views
     if len(splats) <= ONE_AT_A_TIME:
@@ -142,6 +155,21 @@ def tile_views(scene: Scene, use: Callable[[int, TiledView], None], views: Seque
         return
     for view in view_ids:
         tile_and_use(view)
+
+
+def tiles_near(pixels: np.ndarray, distance: float) -> np.ndarray:
+    """Return a mask ``[tile_height,tile_width]`` of the tiles within ``distance`` pixels of a mask ``pixels [h,w]``."""
+    height, width = pixels.shape
+    tiles = np.zeros((-(-height // TILE), -(-width // TILE)), np.uint8)
+    lines, columns = np.nonzero(pixels)
+    tiles[lines // TILE, columns // TILE] = 1
+    around = 2 * math.ceil(distance / TILE) + 1
+    return np.asarray(cv2.dilate(tiles, np.ones((around, around), np.uint8)) > 0)
+
+
+def tile_pixels(tiles: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Return a mask ``[h,w]`` of the pixels of chosen ``tiles [tile_height,tile_width]``."""
+    return tiles.repeat(TILE, 0)[:height].repeat(TILE, 1)[:, :width]
 
 
 def thin_out(gaussians: Gaussians, count: int) -> Gaussians:

@@ -11,6 +11,7 @@ from messages import refuse_all
 
 from gsmerge import Cameras, Gaussians
 from gsmerge.method.raster import (
+    TiledView,
     composite,
     contributions,
     make_splats,
@@ -19,7 +20,8 @@ from gsmerge.method.raster import (
     splat_adjoint,
     tile_view,
 )
-from gsmerge.types import SH_C0
+from gsmerge.method.raster.images import tile_pixels, tile_views, tiles_near
+from gsmerge.types import SH_C0, make_scene
 
 FOCAL = 100.0
 
@@ -221,3 +223,25 @@ def test_tile_lists_end_behind_gaussians_that_hide_the_tile(monkeypatch: pytest.
         assert part == every[: len(part)]
     for values, expected in zip(drawn, whole, strict=True):
         np.testing.assert_array_equal(values, expected)
+
+
+def test_tiles_near_pixels_are_drawn_as_in_the_whole_picture() -> None:
+    """With those within a distance of the pixels, and of each view that has none chosen all."""
+    cameras = camera(90, 70, count=2)
+    pixels = np.zeros((70, 90), bool)
+    pixels[33, 50] = True
+    tiles = tiles_near(pixels, 16)
+    np.testing.assert_array_equal(np.argwhere(tiles), [(y, x) for y in (1, 2, 3) for x in (2, 3, 4)])
+    gaussians = many_balls()
+    whole = render(gaussians, cameras)
+    drawn = np.empty((2, 70, 90, 3), np.float32)
+
+    def draw(view: int, tiled: TiledView) -> None:
+        drawn[view] = composite(tiled)[0]
+
+    tile_views(make_scene(gaussians, cameras), draw, tiles={1: tiles})
+    np.testing.assert_array_equal(drawn[0], whole.images[0])
+    part = tile_pixels(tiles, 70, 90)
+    assert part.sum() == 9 * 16 * 16
+    np.testing.assert_array_equal(drawn[1][part], whole.images[1][part])
+    assert not drawn[1][~part].any()

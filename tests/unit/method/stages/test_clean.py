@@ -153,16 +153,21 @@ def test_what_the_cropped_scene_shows_opaque_stays_opaque(shape: str) -> None:
     low, high = np.quantile(means, (0.2, 0.8), axis=0)
     box = "box:" + ",".join(map(str, (*low, *high)))
     crop = {"sphere": sphere_in(scene, 0.5), "box": box, "turned": f"{box},10,20,30"}[shape]
-    result, inside = compact(scene, crop=crop), crop_scene(scene, crop)
-    assert inside_crop(result.gaussians.means, crop).all()
-    assert result.report.choices["clean"]["cropped"] == 0
-    shown, fitted = (render(some, scene.cameras, background=0.0) for some in (inside.gaussians, result.gaussians))
+    inside = crop_scene(scene, crop)
+    shown = render(inside.gaussians, scene.cameras, background=0.0)
     opaque = shown.alphas[..., 0] > 0.98
-    assert (fitted.alphas[..., 0][opaque] < 0.5).mean() < 0.005
     clear = shown.alphas[..., 0] < 0.02  # not what the photos show behind
-    assert (fitted.alphas[..., 0][clear] > 0.6).sum() < 0.02 * opaque.sum()
-    assert fitted.alphas[..., 0][clear].mean() < 0.02
-    assert decibels(np.square(fitted.images - inside.images)[opaque & inside.masks].mean()) > 30
+    leaks = []
+    for seed in range(2):  # of one seed to another the mean differs by a third
+        result = compact(scene, crop=crop, seed=seed)
+        assert inside_crop(result.gaussians.means, crop).all()
+        assert result.report.choices["clean"]["cropped"] == 0
+        fitted = render(result.gaussians, scene.cameras, background=0.0)
+        assert (fitted.alphas[..., 0][opaque] < 0.5).mean() < 0.005
+        assert (fitted.alphas[..., 0][clear] > 0.6).sum() < 0.02 * opaque.sum()
+        leaks.append(fitted.alphas[..., 0][clear].mean())
+        assert decibels(np.square(fitted.images - inside.images)[opaque & inside.masks].mean()) > 30
+    assert np.mean(leaks) < 0.02
 
 
 def test_what_a_small_part_covers_decides_how_many_show_it() -> None:
