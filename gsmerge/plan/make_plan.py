@@ -112,13 +112,13 @@ def plan_merge(
 def plan_scores(prepared: Prepared, plan: Plan, report_views: int) -> ScorePlan:
     """Choose the views in which input and results are scored, among those whose pictures show the scene.
 
-    A report needs ``report_views``; scores that decide the number of Gaussians take more. All views that were placed
-    count. A quality that the user asks for is measured on all pixels, and small views have too few tiles for a sample.
+    A report needs ``report_views``, and a sample of their tiles, of which small views have too few. Scores that decide
+    the number of Gaussians take more views, and all pixels. All views that were placed count.
     """
     cameras = prepared.scene.cameras
-    decides = plan.count.target_psnr is not None or plan.count.keeps_fidelity
-    samples = not decides and scored_tiles(0, cameras.width, cameras.height, 2) is not None
     views = pictured_views(prepared)
+    is_whole = len(views) <= report_views and scored_tiles(0, cameras.width, cameras.height, 2) is None
+    samples = not (is_whole or plan.count.target_psnr is not None or plan.count.keeps_fidelity)
     if not prepared.reference.placed:
         chosen = pick_views(len(views), report_views) if samples else scored_views(len(views))
         views = tuple(views[i] for i in chosen)

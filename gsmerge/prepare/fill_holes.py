@@ -20,7 +20,7 @@ from gsmerge.method.kernels.pictures import blur
 from gsmerge.method.kernels.reproject import add_differences
 from gsmerge.method.raster import TiledView
 from gsmerge.method.raster.composite import blend_depths
-from gsmerge.method.raster.images import tile_pixels, tile_views, tiles_near
+from gsmerge.method.raster.images import tile_views, tiles_near
 from gsmerge.prepare.photo_change import PhotoChange, change_large
 from gsmerge.runtime.record import note
 from gsmerge.runtime.threads import parallel_map
@@ -77,7 +77,7 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = Fa
         depths, transmittance = blend_depths(tiled)
         covered = transmittance <= 1 - HOLE_OPACITY
         if view in parts:
-            bare[view] &= ~covered & tile_pixels(parts[view], *covered.shape)
+            bare[view] = fillable[view] & ~covered
         else:
             if is_cropped or not everywhere:
                 empty[view] = _find_empty(1 - transmittance, shown[view], gap, is_cropped=is_cropped)

@@ -21,8 +21,7 @@ from gsmerge.runtime.record import stage
 from gsmerge.types import Gaussians, Scene
 
 # The input is scored on one of INPUT_EVERY tiles of the photos. A result is scored on one of RESULT_EVERY tiles,
-# because the far fewer Gaussians of a result are drawn faster. On fifteen captures, the gain (result minus input) on
-# such tiles differs by .27 dB (rms) from the gain on whole photos
+# because the far fewer Gaussians of a result are drawn faster (REPORT_VIEWS says how exact such samples are)
 INPUT_EVERY = 10
 RESULT_EVERY = 2
 
@@ -127,7 +126,7 @@ def _measure_on_files(gaussians: Gaussians, prepared: Prepared, plan: ScorePlan)
     ).psnr
 
 
-def _measure_protected(gaussians: Gaussians, prepared: Prepared, plan: ScorePlan) -> PhotoScore | None:
+def _measure_protected(gaussians: Gaussians, prepared: Prepared) -> PhotoScore | None:
     """Score Gaussians of the world over the protected pixels, in views that have some; None if no view has any.
 
     ``share`` of the score is the share of protected pixels in all photos.
@@ -158,9 +157,7 @@ def score_input(prepared: Prepared, plan: ScorePlan) -> InputScores:
     """Score the Gaussians of the input. The plan may already have the score on the scored photos."""
     photos = plan.before or measure_input(prepared, plan)
     gaussians = prepared.input_scene.file_gaussians
-    return InputScores(
-        photos, _measure_on_files(gaussians, prepared, plan), _measure_protected(gaussians, prepared, plan)
-    )
+    return InputScores(photos, _measure_on_files(gaussians, prepared, plan), _measure_protected(gaussians, prepared))
 
 
 @dataclass(frozen=True)
@@ -192,6 +189,6 @@ def measure_parts(before: InputScores, gaussians: Gaussians, prepared: Prepared,
     rounded = round_for_output(gaussians, plan)
     if before.on_files is not None and (after := _measure_on_files(rounded, prepared, plan)) is not None:
         parts = replace(parts, photo_files=PhotoFiles(before.on_files, after))
-    if before.protected is not None and (score := _measure_protected(rounded, prepared, plan)) is not None:
+    if before.protected is not None and (score := _measure_protected(rounded, prepared)) is not None:
         parts = replace(parts, protected=Covered(score.share, before.protected.covered_psnr, score.covered_psnr))
     return parts

@@ -278,8 +278,9 @@ def test_more_views_are_scored_for_a_quality(scene: Scene) -> None:
     some, every = plan_of(wide), plan_of(wide, quality="20dB")
     assert (len(some.score.views), some.score.samples) == (REPORT_VIEWS, True)
     assert (len(every.score.views), every.score.samples) == (10, False)
-    small = plan_of(scenes.make_scene(scenes.room(), scenes.arc(10, 24, 16)))
-    assert (len(small.score.views), small.score.samples) == (10, False)
+    small, few = (plan_of(scenes.make_scene(scenes.room(), scenes.arc(count, 24, 16))) for count in (10, REPORT_VIEWS))
+    assert (len(small.score.views), small.score.samples) == (REPORT_VIEWS, True)
+    assert (len(few.score.views), few.score.samples) == (REPORT_VIEWS, False)  # of small views all tiles are scored
 
 
 def test_reports_say_what_was_settled(scene: Scene) -> None:

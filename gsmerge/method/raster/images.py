@@ -167,11 +167,6 @@ def tiles_near(pixels: np.ndarray, distance: float) -> np.ndarray:
     return np.asarray(cv2.dilate(tiles, np.ones((around, around), np.uint8)) > 0)
 
 
-def tile_pixels(tiles: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Return a mask ``[h,w]`` of the pixels of chosen ``tiles [tile_height,tile_width]``."""
-    return tiles.repeat(TILE, 0)[:height].repeat(TILE, 1)[:, :width]
-
-
 def thin_out(gaussians: Gaussians, count: int) -> Gaussians:
     """Keep every k-th Gaussian, at most ``count``, but enlarged, so that they cover about the area of all Gaussians."""
     step = max(1, -(-len(gaussians) // count))

@@ -45,7 +45,7 @@ def test_all_of_few_views_and_some_of_many_are_scored() -> None:
 
 def test_report_scores_few_views_that_are_spread() -> None:
     assert [pick_views(count, REPORT_VIEWS) for count in (1, 3)] == [[0], [0, 1, 2]]
-    assert pick_views(84, REPORT_VIEWS) == [5, 15, 26, 36, 47, 57, 68, 78]
+    assert pick_views(84, REPORT_VIEWS) == [7, 21, 35, 49, 63, 77]
 
 
 def test_midpoint_views_are_those_nearest_to_the_middle_of_two_inputs() -> None:
