@@ -235,7 +235,7 @@ class CountSearch:
 
     def _describe_reached(self, num_gaussians: int) -> str:
         """Say which PSNR a result of ``num_gaussians`` reaches."""
-        views = "the input views" if self.left_out is None else "photos left out"
+        views = "the input views" if self.left_out is None else "photos that the search left out"
         return f"{views} reach {self.psnr:.2f} dB with {num_gaussians:,} Gaussians"
 
     def notes(self, num_gaussians: int) -> list[str]:

@@ -246,7 +246,7 @@ def result_table(document: Mapping[str, Any], next_step: str | None = None, *, c
     sizes = [human_bytes(file["bytes"]) for file in files]
     rows = [("Gaussians", counts[0], counts[1], human_share(document["ratio"])), ("file", sizes[0], sizes[1], "")]
     if new := document["new_views"]:
-        gain = f"about {new['after'] - new['before']:+.1f} dB, from {new['views']} photos left out"
+        gain = f"{new['low']:+.1f} to {new['high']:+.1f} dB, by {new['views']} photos left out"
         rows += [("new views", f"{new['before']:.1f} dB", f"{new['after']:.1f} dB", gain)]
     on_files = document.get("psnr_photo_files")
     if on_files and psnr["after"] is not None and all(f"{on_files[name]:.2f}" == f"{psnr[name]:.2f}" for name in psnr):

@@ -109,7 +109,7 @@ def test_psnr_target_is_measured_on_photos_left_out() -> None:
     assert len(search["tried"]) <= 3
     assert easy.num_output == search["count"]
     assert "left out reach" in hard.unmet
-    assert noted(easy.notes, "quality: photos left out reach")
+    assert noted(easy.notes, "quality: photos that the search left out reach")
     assert hard.psnr_after > max(psnr for _, psnr in hard.choices["search"]["tried"])  # own photos, which the fit saw
 
 

@@ -299,7 +299,7 @@ def test_few_builds_meet_a_target_on_photos_left_out(target: float) -> None:
 def test_search_on_photos_left_out_stops_at_the_count_they_gain_from() -> None:
     actual = judge_left_out(lambda count: 20 + log2(count / 1000), 30.0, most=1600)
     assert max(actual.psnrs) == actual.count == 1600
-    reached = "photos left out reach 20.68 dB with 1,600 Gaussians"
+    reached = "photos that the search left out reach 20.68 dB with 1,600 Gaussians"
     unmet = f"quality: 30 dB was asked for; {reached}, the best that was tried"
     assert actual.describe_unmet(actual.best) == unmet
     assert actual.choices["left_out"] == 2
