@@ -46,6 +46,7 @@ FACTORS = 2.0 ** np.linspace(0, 3, 13)  # candidate depths, relative to the dept
 FARTHEST_QUANTILE = 0.99  # quantile of the depths that counts as the farthest
 HOLE_NEIGHBORS = 3  # number of nearest views that a picture is compared with
 DIFFERENCE_BLUR = 3.0  # standard deviation in pixels of the window over which differences are averaged
+SAMPLE = 4  # of as many lines and columns of a view one is sampled where medians of depths are needed
 BARE = 0.02  # opacity up to which the Gaussian of a pixel shows nothing
 
 
@@ -69,8 +70,10 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = Fa
         return scene
     holes, empty, edges = np.zeros_like(fillable), np.zeros_like(fillable), dict[int, _Edges]()
     gap = 2 * round(GAP_WIDTH * max(shown.shape[1:]) / 2) + 1
-    # where each pixel has its own Gaussians, a view without an empty part needs to be drawn only around its holes
-    parts = {view: tiles_near(fillable[view], gap) for view in views if scene.has_own_pixels and not has_empty[view]}
+    # Where each pixel has its own Gaussians, a view without an empty part needs to be drawn only at its holes, and
+    # around them if the depth beside them counts
+    around = gap if scene.depths is None else 0
+    parts = {view: tiles_near(fillable[view], around) for view in views if scene.has_own_pixels and not has_empty[view]}
 
     def find_holes(view: int, tiled: TiledView) -> None:
         """Mark a view's pixels that stay empty, other pixels that its drawing does not cover, and holes to fill."""
@@ -90,9 +93,9 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = Fa
             holes[view] &= cv2.morphologyEx(covered.astype(np.uint8), cv2.MORPH_CLOSE, window) > 0
         if covered.any() and holes[view].any():
             beside = fill_gaps(depths[..., None], covered)[..., 0]
-            front_depths = _measure_fronts(scene, view)
-            known = _fit_map(scene, view, front_depths)
-            surfaces = front_depths[fronts[view] >= 0] if view in parts else depths[covered]
+            own_depths = _measure_fronts(scene, view)
+            known = _fit_map(scene, view, own_depths)
+            surfaces = own_depths[np.isfinite(own_depths)] if view in parts else depths[covered]
             (farthest,) = quantiles(surfaces, [FARTHEST_QUANTILE]) if surfaces.size else (0.0,)
             edges[view] = _Edges(beside[holes[view]], float(farthest), None if known is None else known[holes[view]])
 
@@ -161,30 +164,28 @@ class _Edges:
 
 
 def _measure_fronts(scene: PicturedScene, view: int) -> np.ndarray:
-    """Return the depth ``[h,w]`` of the Gaussian in front at each pixel of a view; NaN where there is none."""
-    fronts = scene.get_pixels().fronts[view]
-    depths = np.full(fronts.shape, np.nan)
-    has_front = fronts >= 0
-    means = scene.gaussians.means[fronts[has_front]].astype(np.float64)
-    depths[has_front] = camera_depths(means, scene.cameras.viewmats[view])
-    return depths
+    """Return the depth of the Gaussian in front at one pixel of SAMPLE x SAMPLE of a view; NaN where there is none."""
+    fronts = scene.get_pixels().fronts[view, ::SAMPLE, ::SAMPLE]
+    means = scene.gaussians.means[np.maximum(fronts, 0)].astype(np.float64)
+    return np.where(fronts >= 0, camera_depths(means, scene.cameras.viewmats[view]), np.nan)
 
 
-def _fit_map(scene: PicturedScene, view: int, front_depths: np.ndarray) -> np.ndarray | None:
+def _fit_map(scene: PicturedScene, view: int, own_depths: np.ndarray) -> np.ndarray | None:
     """Bring a view's depth map to the unit of the scene; return ``[h,w]``, NaN where it has no depth.
 
-    None without a map, or if the map explains the ``front_depths [h,w]`` of the view's Gaussians no better than one
-    depth for all of them does: it does not belong to the view.
+    None without a map, or if the map explains the ``own_depths`` of the view's Gaussians, see :func:`_measure_fronts`,
+    no better than one depth for all of them does: it does not belong to the view.
     """
     if scene.depths is None:
         return None
     known = scene.depths[view].astype(np.float64)
     known[~(np.isfinite(known) & (known > 0))] = np.nan
-    both = np.isfinite(front_depths) & np.isfinite(known)
+    sample = known[::SAMPLE, ::SAMPLE]
+    both = np.isfinite(own_depths) & np.isfinite(sample)
     if not both.any():
         return None
-    depths = front_depths[both]
-    ratios = depths / known[both]
+    depths = own_depths[both]
+    ratios = depths / sample[both]
     usual = median(depths)
     unit = median(ratios)
     explains = median(np.abs(ratios / unit - 1)) < median(np.abs(depths / usual - 1))
