@@ -17,18 +17,10 @@ from typer.core import TyperCommand, TyperGroup
 
 from gsmerge.errors import UsageError
 from gsmerge.settings.reading import FileHints
-from gsmerge.settings.setting import flat_settings, suggest_name
+from gsmerge.settings.setting import SYNONYMS, flat_settings, suggest_name
 
 PROGRAM = "gsmerge"
 LAB = "lab"  # group of research commands
-# Names that other programs give to options, and the different names of the same options here
-SYNONYMS = {
-    **dict.fromkeys(("force", "clobber", "yes"), "overwrite"),
-    **dict.fromkeys(("ratio", "percent", "keep", "count", "num-gaussians"), "budget"),
-    **dict.fromkeys(("format", "to", "type"), "output"),
-    **dict.fromkeys(("photos", "image-dir"), "images"),
-    **dict.fromkeys(("poses", "colmap"), "cameras"),
-}
 # Words that users try as commands, and what does this
 COMMAND_SYNONYMS = {
     **dict.fromkeys(("compress", "reduce", "simplify", "optimize", "prune", "merge", "shrink"), "compact"),
@@ -137,7 +129,7 @@ def _suggest(option: str, command: Any) -> str:
     name = option.lstrip("-").replace("-", "_")
     params = {param.name: param for param in command.params}
     settings = {}
-    synonym = SYNONYMS.get(option.lstrip("-"))
+    synonym = SYNONYMS.get(name)
     with suppress(ImportError):  # the settings of training need torch, which may not be installed
         settings = listed_settings(params["set"].callback.kinds) if "set" in params else {}
     if name.removeprefix("no_") in settings:

@@ -14,7 +14,7 @@ from gsmerge.runtime.plugins import METHODS, find_plugins
 from gsmerge.settings.budget import AUTO, BudgetOptions
 from gsmerge.settings.fit import FitOptions
 from gsmerge.settings.reading import SCENE_ARGUMENTS
-from gsmerge.settings.setting import Settings, flat_settings, setting, settings_of, suggest_name
+from gsmerge.settings.setting import SYNONYMS, Settings, flat_settings, setting, settings_of, suggest_name
 from gsmerge.settings.stages import (
     BlockOptions,
     CleanOptions,
@@ -183,10 +183,11 @@ class CompactOptions(Settings):
         all_settings = flat_settings(CompactOptions)
         unknown = sorted(settings.keys() - all_settings.keys(), key=str)
         if unknown:
-            hint = suggest_name(unknown[0], all_settings)
-            if unknown[0] in SCENE_ARGUMENTS:
-                hint = f": read_scene(path, {unknown[0]}=...) takes it"
-            if unknown[0] in ("output", "out", "path", "overwrite"):
+            meant = SYNONYMS.get(unknown[0], unknown[0])
+            hint = f"; perhaps {meant}" if meant in all_settings else suggest_name(unknown[0], all_settings)
+            if meant in SCENE_ARGUMENTS:
+                hint = f": read_scene(path, {meant}=...) takes it"
+            if meant in ("output", "overwrite"):
                 hint = ": result.save(path) writes the result, in the format of the ending"
             known = f"; known: {', '.join(sorted(all_settings))}"
             raise ValueError(f"unknown setting {unknown[0]!r}{hint or known}")

@@ -197,6 +197,16 @@ def join_words(words: Iterable[str]) -> str:
     return " or ".join(filter(None, (", ".join(listed[:-1]), *listed[-1:])))
 
 
+# Names that other programs give to options and settings, and the different names of the same here
+SYNONYMS = {
+    **dict.fromkeys(("force", "clobber", "yes"), "overwrite"),
+    **dict.fromkeys(("ratio", "percent", "keep", "count", "number", "num_gaussians", "target", "size"), "budget"),
+    **dict.fromkeys(("format", "to", "type", "out", "path"), "output"),
+    **dict.fromkeys(("photos", "image_dir"), "images"),
+    **dict.fromkeys(("poses", "colmap", "viewmats"), "cameras"),
+}
+
+
 def suggest_name(word: Any, names: Iterable[Any]) -> str:
     """Return the end of a message about an unknown word: "; perhaps NAME", or nothing if no name resembles the word."""
     from difflib import get_close_matches

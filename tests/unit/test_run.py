@@ -111,6 +111,8 @@ CALLS: dict[str, Callable[[], Any]] = {
     "scene: expected Scene or Gaussians or a path, got int; gsmerge.read_scene": lambda: ANY.compact(5),
     "options: expected CompactOptions, got dict; settings are named": lambda: ANY.compact(SCENE, {"k": 2}),
     "unknown setting 'output': result.save(path)": lambda: ANY.compact(SCENE, output="small.ply"),
+    "unknown setting 'photos': read_scene(path, images=...)": lambda: ANY.compact(SCENE, photos="photos"),
+    "unknown setting 'num_gaussians'; perhaps budget": lambda: ANY.compact(SCENE, num_gaussians=400),
     "path: expected a path, got Gaussians": lambda: ANY.write_ply(SCENE.gaussians, "a.ply"),
     "gaussians: expected Gaussians, got CompactResult; pass": lambda: ANY.write_ply("a.ply", RESULT),
     "levels: expected Sequence[Gaussians], got Gaussians": lambda: ANY.write_levels("lod-meta.json", SCENE.gaussians),
