@@ -116,7 +116,7 @@ def test_rows_follow_the_longest_series_of_pixels(seed: int, mixed: int) -> None
     rng = np.random.default_rng(seed)
     points, poses = rng.normal(0, 3, (150, 3)).astype(np.float32), make_poses(3, rng)
     ids, tails, ends, before = (np.empty(n, t) for n, t in ((150, "i8"), (150, "i8"), (150, "i4"), (450, "i4")))
-    scratch = ids, tails, ends, before, np.empty(3, np.int64), np.empty(3, np.int32)
+    scratch = ids, tails, ends, before, np.empty(3, np.int64), np.empty(3, np.int32), np.empty(3, np.int64)
     count = follow_pixels(points, poses, np.tile(K, (3, 1, 1)), *scratch, 300, 220, mixed)
     places, shown = places_of(points, poses)
     pixels = np.where(
@@ -133,7 +133,7 @@ def test_rows_follow_the_longest_series_of_pixels(seed: int, mixed: int) -> None
 
 
 def test_scratch_of_another_size_is_refused() -> None:
-    scratch = [np.empty(n, t) for n, t in ((1, "i8"), (1, "i8"), (1, "i4"), (3, "i4"), (2, "i8"), (2, "i4"))]
+    scratch = [np.empty(n, t) for n, t in ((1, "i8"), (1, "i8"), (1, "i4"), (3, "i4"), (2, "i8"), (2, "i4"), (2, "i8"))]
     with pytest.raises(ValueError, match="follow_pixels"):
         follow_pixels(np.zeros((1, 3), np.float32), np.zeros((2, 4, 4)), np.zeros((2, 3, 3)), *scratch, 4, 4, 0)
 

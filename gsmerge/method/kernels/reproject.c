@@ -81,14 +81,33 @@ API void see_points(const double *points, const double *viewmats, const double *
   }
 }
 
+// Find the first of the ascending `tails [length]` that is not less than a key. The search starts at `hint` and doubles
+// its steps, because the next point of a view usually belongs beside the last one.
+static inline int64_t find_tail(const int64_t *tails, int64_t length, int64_t key, int64_t hint) {
+  int64_t low = 0, high = length, step = 1;
+  if (hint < length && tails[hint] < key) {
+    for (low = hint + 1; low + step <= length && tails[low + step - 1] < key; step *= 2) low += step;
+    high = mini(length, low + step - 1);
+  } else {
+    for (high = mini(hint, length); high >= step && tails[high - step] >= key; step *= 2) high -= step;
+    low = maxi(0, high - step + 1);
+  }
+  while (low < high) {
+    int64_t middle = (low + high) / 2;
+    if (tails[middle] < key) low = middle + 1; else high = middle;
+  }
+  return low;
+}
+
 // Find the longest ascending series of keys with at most one key of each point (Schensted 1961). tails [length] is the
 // smallest last key of all series of that length, ends its number i * v + view, and before the number that precedes
 // each key in its series.
 API int64_t follow_pixels(const float *points, const double *viewmats, const double *Ks, int64_t *ids, int64_t *tails,
-                          int32_t *ends, int32_t *before, int64_t *keys, int32_t *views, int64_t width,
-                          int64_t height, int32_t mixed, int64_t n, int64_t v, int64_t m) {
+                          int32_t *ends, int32_t *before, int64_t *keys, int32_t *views, int64_t *hints,
+                          int64_t width, int64_t height, int32_t mixed, int64_t n, int64_t v, int64_t m) {
   int64_t length = 0, area = width * height;
   if (m != n * v) return -1;
+  for (int64_t view = 0; view < v; view++) hints[view] = 0;
   double place[3];
   for (int64_t i = 0; i < n; i++) {
     double point[3] = {points[3 * i], points[3 * i + 1], points[3 * i + 2]};
@@ -103,12 +122,8 @@ API int64_t follow_pixels(const float *points, const double *viewmats, const dou
     }
     // the largest key comes first, so that no key follows another key of the same point
     for (int64_t k = 0; k < count; k++) {
-      int64_t low = 0, high = length;
-      while (low < high) {
-        int64_t middle = (low + high) / 2;
-        if (tails[middle] < keys[k]) low = middle + 1; else high = middle;
-      }
-      int64_t number = i * v + views[k];
+      int64_t low = find_tail(tails, length, keys[k], hints[views[k]]), number = i * v + views[k];
+      hints[views[k]] = low;
       before[number] = low ? ends[low - 1] : -1;
       tails[low] = keys[k], ends[low] = (int32_t)number;
       if (low == length) length++;

@@ -48,14 +48,15 @@ def see_points(points, viewmats, Ks, depths, width, height, near, behind):
 @native(
     COUNT, points=f4("n", 3), viewmats=f8("v", 4, 4), Ks=f8("v", 3, 3), ids=i8("n", out=True),
     tails=i8("n", out=True), ends=i4("n", out=True), before=i4("m", out=True), keys=i8("v", out=True),
-    views=i4("v", out=True), width=i8(least=1), height=i8(least=1), mixed=i4(least=0, most=1),
+    views=i4("v", out=True), hints=i8("v", out=True), width=i8(least=1), height=i8(least=1),
+    mixed=i4(least=0, most=1),
 )  # fmt: skip
-def follow_pixels(points, viewmats, Ks, ids, tails, ends, before, keys, views, width, height, mixed):
+def follow_pixels(points, viewmats, Ks, ids, tails, ends, before, keys, views, hints, width, height, mixed):
     """Choose pixels of points so that the order of as many points as possible is the order of their pixels.
 
     A point may project into several views. The chosen pixels are written to ``ids``, and -1 for points without a pixel.
     Returns the number of points with a pixel. Pixels are ordered by view and then by line. If ``mixed`` is 1, pixels
-    are ordered by line and column, and then by view. The arrays from ``tails`` to ``views`` are scratch, of which
+    are ordered by line and column, and then by view. The arrays from ``tails`` to ``hints`` are scratch, of which
     ``before`` has n·v values.
     """
 

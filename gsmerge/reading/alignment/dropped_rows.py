@@ -283,7 +283,7 @@ def follow_rows(
     views = len(viewmats)
     ids = np.empty(count, np.int64)
     scratch_of_rows = np.empty(count, np.int64), np.empty(count, np.int32), np.empty(count * views, np.int32)
-    scratch = *scratch_of_rows, np.empty(views, np.int64), np.empty(views, np.int32)
+    scratch = *scratch_of_rows, np.empty(views, np.int64), np.empty(views, np.int32), np.empty(views, np.int64)
     follow_pixels(points, viewmats, Ks, ids, *scratch, width, height, int(mixed))
     return ids
 
