@@ -158,21 +158,24 @@ def _compare(own: SmallView, others: Sequence[SmallView]) -> tuple[np.ndarray, n
     shape = own.known.shape
     num_through = np.zeros(own.known.size, np.int64)
     num_same = np.zeros(own.known.size, np.int64)
-    pictures = np.full((len(others), *shape, 3), NO_COLOR)  # what each other view shows in the pixels of the photo
-    layers = np.zeros((len(others), *shape))  # depths in the photo's camera of what is shown; 0 for nothing
-    for other, picture, layer in zip(others, pictures, layers, strict=True):
+    for other in others:
         ids, pixels, depths = _look_up(other, own.means)
         inside = own.known.reshape(-1)[ids] & other.known.reshape(-1)[pixels]
         # through the pixels around as well, because a view sees by chance past the silhouette of a thing
         num_through[ids] += inside & (other.least_depths.reshape(-1)[pixels] > THROUGH * depths)
         surface = other.depths.reshape(-1)[pixels]
         num_same[ids] += inside & (surface < SAME_DEPTH * depths) & (depths < SAME_DEPTH * surface)
+    seen_through = own.known & ((num_through >= 2) & (num_through > 2 * num_same)).reshape(shape)
+    if seen_through.mean() < LEAST_PART:  # as in most views without a passer-by
+        return seen_through, np.zeros_like(seen_through)
+    pictures = np.full((len(others), *shape, 3), NO_COLOR)  # what each other view shows in the pixels of the photo
+    layers = np.zeros((len(others), *shape))  # depths in the photo's camera of what is shown; 0 for nothing
+    for other, picture, layer in zip(others, pictures, layers, strict=True):
         ids, pixels, depths = _look_up(own, other.means)
         order = np.argsort(-depths, kind="stable")  # the nearest is last, and hides what is behind
         order = order[other.known.reshape(-1)[ids[order]]]
         picture.reshape(-1, 3)[pixels[order]] = other.photo.reshape(-1, 3)[ids[order]]
         layer.reshape(-1)[pixels[order]] = depths[order]
-    seen_through = own.known & ((num_through >= 2) & (num_through > 2 * num_same)).reshape(shape)
     # only the views that see the farthest surface, because passers-by may hide it from the other views
     shows = (layers > 0) & (layers * THROUGH * THROUGH > layers.max(0)) & (layers < FAR * median(own.depths[own.known]))
     count = shows.sum(0)
