@@ -1,11 +1,10 @@
-"""The README's demo and its installation run as printed, each in a fresh environment."""
+"""The README's demo and its installation run as printed, in a fresh environment."""
 
 from __future__ import annotations
 
 import os
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -28,16 +27,16 @@ def run(block: str, folder: Path, **variables: str) -> None:
     assert done.returncode == 0, f"{block}\n{done.stdout[-500:]}\n{done.stderr[-2000:]}"
 
 
-def test_demo_of_the_readme_makes_its_picture(project: Path) -> None:
+def test_demo_and_installation_of_the_readme(project: Path, tmp_path: Path) -> None:
+    """One test, so that what the package needs is installed once: the installation takes the demo's environment.
+
+    It is tried in the folder that the project is cloned into, where ``gsmerge`` is not the package.
+    """
     run("python3 tasks.py demo", project)
     assert (project / "demo" / "preview.png").exists()
-
-
-def test_installed_package_has_the_command(project: Path, tmp_path: Path) -> None:
-    """In the folder that the project is cloned into, where ``gsmerge`` is not the package."""
-    run(f'"{sys.executable}" -m venv venv', tmp_path)
-    path = f"{tmp_path / 'venv' / 'bin'}:{os.environ['PATH']}"
-    shutil.copytree(project, tmp_path / "gsmerge", ignore=shutil.ignore_patterns(".venv", "demo"))
+    path = f"{project / '.venv' / 'bin'}:{os.environ['PATH']}"
+    ignored = shutil.ignore_patterns(".venv", "demo", "build", "*.egg-info", "__pycache__", "kernels-*")
+    shutil.copytree(project, tmp_path / "gsmerge", ignore=ignored)
     run("pip install ./gsmerge", tmp_path, PATH=path)
     run("python gsmerge/examples/01_make_scene.py made --width 64 --height 48 && cp -r made/. .", tmp_path, PATH=path)
     run("gsmerge scene.ply", tmp_path, PATH=path, BROWSER="true")
