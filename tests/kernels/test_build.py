@@ -13,7 +13,7 @@ from scripts import load_script
 from sweeps import sweep
 
 from gsmerge.method.kernels import build as module
-from gsmerge.method.kernels.build import build_libraries, compiler, find_platform, hash_sources
+from gsmerge.method.kernels.build import Platform, build_libraries, compiler, find_platform, hash_sources
 
 HEADS = {"linux": b"\x7fELF", "macosx": b"\xcf\xfa\xed\xfe", "win": b"MZ"}
 PLATFORMS = (  # the first has one target alone, which takes the least time
@@ -22,15 +22,24 @@ PLATFORMS = (  # the first has one target alone, which takes the least time
 )  # fmt: skip
 
 
-@sweep("tag", PLATFORMS, often=0)
-def test_libraries_of_every_platform_are_built_here(tag: str, tmp_path: Path) -> None:
-    where = find_platform(tag)
-    paths = build_libraries(tmp_path, platform=tag)
+def check_libraries(paths: list[Path], where: Platform) -> None:
+    """Check names, formats, functions and hash of a platform's libraries."""
     assert [path.name for path in paths] == [where.library_name(target) for target in where.targets]
     for path in paths:
         content = path.read_bytes()
         assert content.startswith(HEADS[where.system])
         assert all(name in content for name in (b"blend_backward", b"sources_hash", hash_sources().encode()))
+
+
+def test_the_installation_has_built_the_libraries_of_this_platform() -> None:
+    where = find_platform()
+    check_libraries([module.FOLDER / where.library_name(target) for target in where.targets], where)
+
+
+@sweep("tag", [tag for tag in PLATFORMS if find_platform(tag) != find_platform()], often=0)
+def test_libraries_of_every_other_platform_are_built_here(tag: str, tmp_path: Path) -> None:
+    paths = build_libraries(tmp_path, platform=tag)
+    check_libraries(paths, find_platform(tag))
     assert sorted(tmp_path.iterdir()) == sorted(paths)
     if tag == "manylinux_2_17_aarch64":  # of one target, which takes the least time
         assert [path.read_bytes() for path in build_libraries(tmp_path / "again", platform=tag)] == [
