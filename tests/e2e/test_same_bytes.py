@@ -1,7 +1,7 @@
 """Every processor writes the same bytes of eight results, which take two to three seconds together.
 
-Other processors are stood for by targets of the native library and by what NumPy, its BLAS, OpenCV, its IPP and torch
-leave unused (also tools/processors.py).
+Other processors are stood for by targets of the native library and by what NumPy, its BLAS, OpenCV, its IPP, torch and
+the C library leave unused (also tools/processors.py).
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ def plain() -> dict[str, str]:
         "OPENCV_CPU_DISABLE": "AVX512-SKX,AVX2,FP16",
         "OPENCV_IPP": "disabled",
         "ATEN_CPU_CAPABILITY": "default",
+        "GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX2,-FMA",
     }
 
 
