@@ -19,7 +19,7 @@ from gsmerge.runtime.record import record_run
 
 VIEWS = 6
 SEEDS = (20, 4, 9, 0, 1, 2, 3, 5, 6, 7, 8, 10)  # the first three lost photos while these had to be like drawings
-SIZES = {(192, 128): SEEDS, (320, 214): SEEDS[:4], (480, 320): SEEDS[:2]}
+SIZES = {(192, 128): SEEDS, (320, 214): SEEDS[:2], (480, 320): SEEDS[:1]}
 CASES = [(size, seed) for size, seeds in SIZES.items() for seed in seeds]
 
 
@@ -30,7 +30,7 @@ def shuffle_rows(ply: Path) -> None:
     ply.write_bytes(head + end + np.random.default_rng(0).permutation(rows).tobytes())
 
 
-@sweep(("size", "seed"), CASES, ids=[f"{width} x {height} seed {seed}" for (width, height), seed in CASES], often=1)
+@sweep(("size", "seed"), CASES, ids=[f"{width} x {height} seed {seed}" for (width, height), seed in CASES], often=0)
 def test_photos_named_by_cameras_stay_beside_noisy_rows(tmp_path: Path, size: Any, seed: int) -> None:
     folder = write_scene(tmp_path / "room", num_views=VIEWS, width=size[0], height=size[1], seed=seed)
     shuffle_rows(folder / "scene.ply")
