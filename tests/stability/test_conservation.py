@@ -3,19 +3,29 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
 import scenes
 from sweeps import sweep
 
-from gsmerge import Gaussians, Scene, compact
-
-compacted = partial(scenes.compacted, poses="fixed")
+from gsmerge import CompactResult, Gaussians, Scene, compact
 
 SCENES = {"wall": scenes.wall, "planes": scenes.two_planes, "room": scenes.room}
 EACH = [*(pytest.param(name, marks=pytest.mark.slow) for name in ("wall", "planes")), "room"]
+
+
+# By scene and settings: several tests read some of them. The scene is kept, so that no other one has its id
+RESULTS: dict[tuple[int, str], tuple[Scene, CompactResult]] = {}
+
+
+def compacted(scene: Scene, **settings: Any) -> CompactResult:
+    """Call :func:`scenes.compacted` with fixed poses, once for the same scene and settings."""
+    key = id(scene), repr(sorted({"k": 1, **settings}.items()))
+    if key not in RESULTS:
+        RESULTS[key] = scene, scenes.compacted(scene, poses="fixed", **settings)
+    return RESULTS[key][1]
 
 
 def build(name: str, noise: float) -> Scene:
