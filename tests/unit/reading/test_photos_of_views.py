@@ -19,13 +19,14 @@ from sweeps import sweep
 from gsmerge.errors import SceneError
 from gsmerge.reading.read_scene import Loaded, load_scene
 
-VIEWS = 4
+VIEWS, WIDTH, HEIGHT = 4, 128, 96
+MIDDLE = slice(28, 100)  # columns of a portrait
 TAGS = {0: 1, 2: 3, 3: 6, 1: 8}  # of orientation, by the quarters that viewers turn a picture counterclockwise
 
 
 def write_room(folder: Path) -> Path:
     """Write a scene of which each row has its pixel."""
-    return write_scene(folder, num_views=VIEWS, width=192, height=144)
+    return write_scene(folder, num_views=VIEWS, width=WIDTH, height=HEIGHT)
 
 
 @pytest.fixture
@@ -177,24 +178,24 @@ def test_photos_in_tiff_and_avif_are_read(folder: Path, truth: np.ndarray, endin
     assert right_ones(loaded, truth) == [True] * 4
 
 
-@pytest.mark.parametrize("sizes", ["apart", "of all"])
+@sweep("sizes", ["apart", "of all"])
 def test_photo_of_another_shape_is_used_if_its_camera_has_its_shape(
     folder: Path, truth: np.ndarray, sizes: str
 ) -> None:
     """A portrait among landscapes: it is extended with its Gaussians' pixels, or its view is left out."""
     path, file = photos_in(folder)[3], folder / "transforms.json"
-    picture = (read(path)[:, 42:150] * 255).astype(np.uint8)
+    picture = (read(path)[:, MIDDLE] * 255).astype(np.uint8)
     Image.fromarray(picture).save(path)
     data = PlyData.read(str(folder / "scene.ply"), mmap=False)
-    rows = data["vertex"].data.reshape(VIEWS, 144, 192)
-    kept = np.concatenate([rows[:3].reshape(-1), rows[3, :, 42:150].reshape(-1)])
+    rows = data["vertex"].data.reshape(VIEWS, HEIGHT, WIDTH)
+    kept = np.concatenate([rows[:3].reshape(-1), rows[3, :, MIDDLE].reshape(-1)])
     PlyData([PlyElement.describe(kept, "vertex")]).write(str(folder / "scene.ply"))
     cameras = json.loads(file.read_text())
     if sizes == "apart":
         common = {key: cameras[key] for key in ("w", "h", "fl_x", "fl_y", "cx", "cy")}
         for frame in cameras["frames"]:
             frame |= common
-        cameras["frames"][3] |= {"w": 108, "cx": common["cx"] - 42}
+        cameras["frames"][3] |= {"w": MIDDLE.stop - MIDDLE.start, "cx": common["cx"] - MIDDLE.start}
         cameras = {key: value for key, value in cameras.items() if key not in common}
         file.write_text(json.dumps(cameras))
     loaded = load_scene(folder)
@@ -218,9 +219,10 @@ def test_a_photo_of_another_shape_than_its_camera_is_left_out_alone(folder: Path
     assert loaded.scene.has_own_pixels
     assert [right for view, right in enumerate(right_ones(loaded, truth)) if view != 1] == [True] * 3
     assert loaded.doubts
-    assert names(str(loaded.doubts), "photos of 1 of 4 views", path.name, "100 x 100", "192 x 144")
+    assert names(str(loaded.doubts), "photos of 1 of 4 views", path.name, "100 x 100", f"{WIDTH} x {HEIGHT}")
 
 
+@pytest.mark.slow
 def test_photos_that_no_camera_names_beside_rows_of_nothing_are_refused(folder: Path) -> None:
     """Are refused with the reason why the cameras are."""
     name_frames(folder, lambda view, name: f"elsewhere/{view}.png")
@@ -233,6 +235,7 @@ def test_photos_that_no_camera_names_beside_rows_of_nothing_are_refused(folder: 
         load_scene(folder, cameras=folder / "transforms.json", images=folder / "images")
 
 
+@pytest.mark.slow
 @sweep("view", [0, 2, 3])
 def test_views_without_gaussians_are_not_there_where_cameras_are_estimated(
     folder: Path, truth: np.ndarray, view: int
@@ -241,7 +244,7 @@ def test_views_without_gaussians_are_not_there_where_cameras_are_estimated(
     data = PlyData.read(str(folder / "scene.ply"), mmap=False)
     rows = data["vertex"].data
     for name in rows.dtype.names:
-        rows[name][view * 144 * 192 : (view + 1) * 144 * 192] = np.nan
+        rows[name].reshape(VIEWS, -1)[view] = np.nan
     data.write(str(folder / "scene.ply"))
     assert right_ones(load_scene(folder), np.delete(truth, view, 0)) == [True] * 3
 
@@ -252,6 +255,10 @@ def test_smaller_copies_of_photos_are_used_where_they_are_alone(folder: Path, tr
     assert absent(loaded) == []
 
 
+def cut_off(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
 def dangle(path: Path) -> None:
     path.unlink()
     path.symlink_to("nowhere.png")
@@ -259,7 +266,7 @@ def dangle(path: Path) -> None:
 
 @pytest.mark.parametrize(
     "spoil",
-    [os.unlink, lambda path: path.write_bytes(b""), lambda path: path.write_bytes(path.read_bytes()[:20_000]), dangle],
+    [os.unlink, lambda path: path.write_bytes(b""), cut_off, dangle],
     ids=["missing", "empty", "cut off", "a link to nothing"],
 )
 def test_missing_or_damaged_photo_leaves_out_its_view_alone(
