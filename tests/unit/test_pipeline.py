@@ -66,6 +66,7 @@ def test_a_result_that_loses_what_the_input_covers_is_worse(scene: Scene) -> Non
     assert report.worse is not None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("settings", "scored_all", "near"), [({}, False, 1.5), ({"budget": 9}, True, 1e-4)])
 def test_a_sample_is_scored_unless_the_result_may_be_worse(settings: Any, scored_all: bool, near: float) -> None:
     """Then all photos decide, and the report is exact."""

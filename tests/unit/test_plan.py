@@ -202,6 +202,7 @@ def test_what_asks_for_a_count_decides_it(settings: dict[str, Any], scene: Scene
         assert not plan_of(known).count.keeps_fidelity
 
 
+@pytest.mark.slow
 def test_photos_of_another_scene_decide_no_count(scene: Scene) -> None:
     noise = np.random.default_rng(0).random(scene.images.shape, np.float32)
     rows = unaligned_scenes.without_order(replace(scene, images=noise))
@@ -273,6 +274,7 @@ def test_cameras_move_where_it_is_asked_for(scene: Scene) -> None:
     assert not unfitted.move_cameras
 
 
+@pytest.mark.slow
 def test_more_views_are_scored_for_a_quality(scene: Scene) -> None:
     wide = scenes.make_scene(scenes.room(), scenes.arc(10, 240, 224))
     some, every = plan_of(wide), plan_of(wide, quality="20dB")

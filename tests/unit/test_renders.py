@@ -46,6 +46,7 @@ def distance(gaussians: Gaussians, scene: Scene, cameras: Cameras) -> np.ndarray
     return np.array([psnr(a, b) for a, b in zip(after, before, strict=True)])
 
 
+@pytest.mark.slow
 def test_nearer_to_the_input_than_superpixels(scene: Scene) -> None:
     """Two fits to renders, which take half a second each."""
     pairs, superpixels = (compact(scene, budget="4%", **more).gaussians for more in ({}, {"max_color": 0.11}))
@@ -105,6 +106,7 @@ def test_a_fit_brings_them_nearer_where_few_are_left(scene: Scene) -> None:
     assert distance(fitted.gaussians, scene, between).mean() > distance(merged.gaussians, scene, between).mean() + 2
 
 
+@pytest.mark.slow
 def test_what_looks_like_the_input_already_gains_by_a_fit_as_well(scene: Scene) -> None:
     fitted, unfitted = (compact(scene, budget="60%", fit=fit).report.choices["fidelity"] for fit in ("full", "none"))
     assert unfitted["psnr"] > 36
@@ -122,7 +124,7 @@ def test_a_view_that_shows_nothing_says_nothing_of_a_result(scene: Scene) -> Non
 
 @pytest.mark.parametrize("settings", [{"budget": 200}, {"superpixels": 25, "k": 2}])
 def test_counts_and_cameras_are_as_asked_for(settings: dict[str, object], scene: Scene) -> None:
-    result = compact(scene, fit_steps=150, **settings)
+    result = compact(scene, fit_steps=15, **settings)
     assert len(result.gaussians) == 200
     np.testing.assert_array_equal(result.cameras.viewmats, scene.cameras.viewmats)
 

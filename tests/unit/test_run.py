@@ -140,6 +140,7 @@ def test_names_of_other_packages_lead_to_those_of_this_one(name: str, use: str) 
         getattr(gsmerge, name)
 
 
+@pytest.mark.slow
 def test_gaussians_alone_are_a_scene_without_views() -> None:
     alone = replace(SCENE, cameras=NO_CAMERAS, images=None, pixels=None, names=())
     one, other = (gsmerge.compact(each, budget=40, effort="draft") for each in (SCENE.gaussians, alone))

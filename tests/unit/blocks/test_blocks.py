@@ -76,6 +76,7 @@ def test_seams_of_a_room_that_all_views_see_take_more_steps(reach: float, looks:
     assert seams["steps"] > 100 or looks == 2
 
 
+@pytest.mark.slow
 def test_a_device_limits_the_gaussians_of_all_blocks_together(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """As many as it draws in all, not in each block; fewer where superpixels ask for fewer."""
     monkeypatch.setitem(DEVICES, "quest3", 200)

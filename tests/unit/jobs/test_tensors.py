@@ -134,6 +134,7 @@ def test_rows_with_nan_are_set_aside_without_a_change_of_the_input(scene: Scene)
     assert np.isfinite(small.gaussians.means).all()
 
 
+@pytest.mark.slow
 def test_gaussians_without_pixels_are_compacted(scene: Scene) -> None:
     rows = np.random.default_rng(0).permutation(len(scene.gaussians))[:-9]
     given = tensors_of(scene, **{name: getattr(scene.gaussians, name)[rows] for name in FIELDS})

@@ -11,6 +11,7 @@ import scenes
 import unaligned_scenes
 from messages import noted
 from panoramas import cut_views, shrunk
+from sweeps import sweep
 
 from gsmerge import CompactResult, Scene, compact, render
 from gsmerge.method.compare.colors import (
@@ -83,7 +84,7 @@ def test_photos_that_differ_are_told_with_their_share(side: int, room: Scene) ->
     assert "1 of 4 photos differ in part" in change
 
 
-@pytest.mark.parametrize(
+@sweep(
     "look",
     [grey, false_colors, styled, lambda colors: colors[..., ::-1]],
     ids=["grey", "false colours", "styled", "BGR"],
@@ -97,7 +98,7 @@ def test_a_scene_keeps_its_look_beside_other_photos(look: Callable[[Colors], Col
     assert own < 0.6 * photos  # clearly nearer to its own look
 
 
-@pytest.mark.parametrize("look", [grey, false_colors, styled])
+@sweep("look", [styled, grey, false_colors])
 def test_the_look_of_photos_is_taken_where_that_is_asked_for(look: Callable[[Colors], Colors], room: Scene) -> None:
     scene = with_look(room, look)
     result = compact(scene, **FIT, look="photos")

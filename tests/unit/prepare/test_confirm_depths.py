@@ -10,6 +10,7 @@ import pytest
 import scenes
 import unaligned_scenes
 from motions import with_nearer_half
+from sweeps import sweep
 
 import gsmerge
 from gsmerge import Cameras, Scene
@@ -102,7 +103,7 @@ def test_pixels_of_a_view_that_looks_elsewhere_are_alone(wall: Scene) -> None:
     assert agreement.confirmed > 0.7
 
 
-@pytest.mark.parametrize("spoilt", [[], [1], [0, 2]])
+@sweep("spoilt", [[0, 2], [1], []])
 def test_shares_of_agreement_are_those_of_a_plain_loop(spoilt: list[int], wall: Scene) -> None:
     """But for the pixels that are drawn."""
     scene = with_nearer_half(wall, spoilt)

@@ -13,6 +13,7 @@ import pytest
 import scenes
 from exports import da3_rows, export_rows, save_export, smooth_scene
 from messages import noted
+from sweeps import sweep
 from tiny_scene import write_npz
 
 from gsmerge import Scene, compact
@@ -225,7 +226,7 @@ LOST: dict[str, tuple[Callable[[np.ndarray], None], float]] = {  # changes of ro
 }
 
 
-@pytest.mark.parametrize("kind", LOST)
+@sweep("kind", LOST)
 def test_rows_that_show_nothing_cost_little(tmp_path: Path, kind: str) -> None:
     """They are set aside, and what the photos show in their place is there."""
     tiny, (change, cost) = smooth_scene(96, 72), LOST[kind]
@@ -284,6 +285,7 @@ def test_a_part_without_rows_stays_empty(room: Scene) -> None:
     assert "4 of 4 views" in notes[0]
 
 
+@pytest.mark.slow
 def test_thin_rows_are_not_taken_for_empty_parts(room: Scene) -> None:
     """Rows of which a ray meets a sixth show the whole room; without those of the top they show all but the top."""
     for scene, count in ((room, 0), (without_top(room), 1)):

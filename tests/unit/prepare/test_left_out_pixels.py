@@ -10,6 +10,7 @@ import pytest
 import scenes
 from PIL import Image
 from saved_cameras import write_transforms
+from sweeps import sweep
 
 from gsmerge import Compactor, Gaussians, Scene, compact, read_scene, render, write_ply
 from gsmerge.method.raster.metrics import decibels
@@ -43,7 +44,7 @@ def over_both(gaussians: Gaussians, truth: Scene) -> float:
     return min(decibels(float(np.square(error).mean())) for error in errors)
 
 
-@pytest.mark.parametrize("color", [(1.0, 1.0, 1.0), (0.0, 0.0, 0.0), (0.2, 0.7, 0.3)], ids=["white", "black", "green"])
+@sweep("color", [(1.0, 1.0, 1.0), (0.0, 0.0, 0.0), (0.2, 0.7, 0.3)], ids=["white", "black", "green"])
 def test_a_uniform_background_is_no_surface(ball: Scene, color: tuple[float, float, float]) -> None:
     alphas = render(ball.gaussians, ball.cameras).alphas
     scene = replace(ball, images=ball.images + (1 - alphas) * np.float32(color))
@@ -59,6 +60,7 @@ def test_a_background_with_content_is_a_surface(ball: Scene, room: Scene) -> Non
     assert not any("one colour" in note for note in notes)
 
 
+@pytest.mark.slow
 def test_what_masks_leave_out_keeps_what_the_input_shows(room: Scene) -> None:
     """Whether the masks are hard or soft, and whether the rows are pixels or not."""
     masks = np.full((4, HEIGHT, WIDTH), True)
@@ -99,7 +101,7 @@ def test_photos_of_an_object_are_compared_without_their_background(ball: Scene, 
         assert prepared.scene.masks[inside].mean() > 0.6
 
 
-@pytest.mark.parametrize("way", ["blocks", "state", "state read from its file"])
+@sweep("way", ["state read from its file", "state", "blocks"])
 def test_what_is_empty_stays_empty_in_blocks_and_states(way: str, ball: Scene, room: Scene, tmp_path: Path) -> None:
     """Blocks share views where they meet, and a state keeps which pixels of its pictures count."""
     alphas = render(ball.gaussians, ball.cameras).alphas[..., 0]
@@ -133,7 +135,7 @@ def test_large_gaussians_do_not_eat_the_edge_of_an_object(ball: Scene) -> None:
 
 
 @pytest.mark.parametrize("part", ["an object", "all but the sky"])
-@pytest.mark.parametrize("has_pixels", [True, False])
+@sweep("has_pixels", [True, False])
 def test_what_was_cut_away_stays_empty_beside_photos_of_the_whole(part: str, has_pixels: bool, room: Scene) -> None:
     if part == "an object":
         near = np.linalg.norm(room.gaussians.means - np.array([0.2, 0.1, 2.6]), axis=1) < 0.55
@@ -147,7 +149,7 @@ def test_what_was_cut_away_stays_empty_beside_photos_of_the_whole(part: str, has
     assert over_both(result, cut) > 27.5
 
 
-@pytest.mark.parametrize("is_opaque", [True, False], ids=["masks", "transparency"])
+@sweep("is_opaque", [True, False], ids=["masks", "transparency"])
 def test_cut_out_photos_of_an_object_leave_its_surroundings_empty(is_opaque: bool, ball: Scene, tmp_path: Path) -> None:
     """Whether soft masks lie beside them, or the photos are transparent there and white below that."""
     alphas = render(ball.gaussians, ball.cameras).alphas

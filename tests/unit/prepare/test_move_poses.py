@@ -184,6 +184,7 @@ def test_compacting_notes_the_views_that_it_moved(scene: Scene) -> None:
     assert after > before + 1  # over all views: a draft's report is of two
 
 
+@pytest.mark.slow
 def test_a_run_with_right_poses_gives_the_result_of_fixed_poses(scene: Scene) -> None:
     settings = {"fit_steps": 12, "superpixels": "2%"}
     fixed, auto = (compact(scene, **settings, poses=poses) for poses in ("fixed", "auto"))

@@ -107,6 +107,7 @@ def test_placed_views_together_see_most_of_the_scene(prepared: Prepared) -> None
     assert seen.any(0).mean() > 0.95
 
 
+@pytest.mark.slow
 def test_placed_views_judge_fog_or_holes_as_worse(bare: Scene) -> None:
     """A result that lacks a part, or has a cloud beside the scene, is judged worse than one that has neither.
 
@@ -143,6 +144,7 @@ def test_a_scene_without_cameras_gets_one_note(bare: Scene) -> None:
     assert noted(record.notes, "no cameras", "--cameras", "--images")
 
 
+@pytest.mark.slow
 def test_gaussians_far_behind_all_placed_views_take_part(bare: Scene) -> None:
     """Also what lies behind all views takes part."""
     far = unaligned_scenes.far_behind(bare.gaussians, 40)

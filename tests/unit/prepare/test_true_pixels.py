@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import scenes
 import unaligned_scenes
+from sweeps import sweep
 
 from gsmerge import Gaussians, Scene, compact
 from gsmerge.method.geometry.frame import canonicalise
@@ -135,7 +136,7 @@ def test_sizes_of_a_sound_scene_are_not_raised_for_views_of_few_pixels(room: Sce
     assert raise_sizes(replace(scene, gaussians=resized(scene.gaussians, 0.01)))[0] is not scene
 
 
-@pytest.mark.parametrize("factor", [1 / 30, 1e-5])
+@sweep("factor", [1 / 30, 1e-5])
 @pytest.mark.parametrize("kind", ["grid", "shuffled", "no cameras"])
 def test_tiny_gaussians_are_merged_as_well_as_sound_ones(kind: str, factor: float) -> None:
     """The input is drawn well by the low-pass alone, and the result is about as good as that of sound Gaussians."""

@@ -111,6 +111,7 @@ def test_a_run_is_made_again_without_the_fit_that_spoiled_it(room: Scene, monkey
     assert "without a fit" in again[0]
 
 
+@pytest.mark.slow
 def test_a_run_is_refused_where_every_way_ends_far_from_the_input(room: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     spoil_fits(monkeypatch, merges=True)
     with refuses(TargetError, "expected a result as good as its input, found none", "--budget"):

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import scenes
 from slow_readers import corners
+from sweeps import sweep
 
 from gsmerge import EvaluateOptions, Gaussians, Scene, compact, evaluate, read_scene, render
 from gsmerge.io import kept_comments, read_gaussians, write_gaussians, write_ply
@@ -126,7 +127,7 @@ def wall() -> Scene:
     return replace(scene, gaussians=replace(scene.gaussians, scales=0.3 * scene.gaussians.scales))
 
 
-@pytest.mark.parametrize(("comment", "expected"), [("SplatRenderMode: mip", True), ("antialiased 0", False)])
+@sweep(("comment", "expected"), [("SplatRenderMode: mip", True), ("antialiased 0", False)])
 def test_a_scene_is_drawn_as_its_file_says(wall: Scene, comment: str, expected: bool, tmp_path: Path) -> None:
     scene = read_scene(mark(write(tmp_path / "a.ply", wall.gaussians), comment))
     assert scene.cameras.antialiased is expected

@@ -14,6 +14,7 @@ import zstandard
 from damage.gaussians import add_record, axes_record
 from former_formats import spz4_bytes
 from slow_readers import corners
+from sweeps import sweep
 
 from gsmerge import Gaussians, SceneError
 from gsmerge.errors import list_doubts
@@ -177,7 +178,7 @@ def checked_spz4(gaussians: Gaussians, monkeypatch: pytest.MonkeyPatch) -> bytes
     return spz4_bytes(gaussians)
 
 
-@pytest.mark.parametrize("version", [3, 4])
+@sweep("version", [3, 4])
 def test_damage_that_a_checksum_shows_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, version: int) -> None:
     """One wrong bit anywhere in the compressed columns, or a stream without its end."""
     content = spz_bytes(some_gaussians(0)) if version == 3 else checked_spz4(some_gaussians(0), monkeypatch)

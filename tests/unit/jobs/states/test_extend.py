@@ -145,6 +145,7 @@ def test_a_batch_that_shows_something_else_is_refused_unless_asked_for(room: Sce
     assert compare_worlds(earlier, views, centre + 0.5 * rays) == "not known"
 
 
+@pytest.mark.slow
 def test_a_batch_without_cameras_adds_gaussians_alone(room: Scene) -> None:
     alone = Scene(room.gaussians, room.cameras[[]], None, None, ())
     only, after = fed(alone), fed(scenes.take_views(room, range(3)), alone)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 from panoramas import cut_views, show, shrunk, take_photos
+from sweeps import sweep
 
 from gsmerge.method.compare.assign_photos import FIRST_PHOTOS, Assigner, Assignment, Candidates, assign_photos
 from gsmerge.method.compare.offsets import OFFSET_PIXELS, find_offsets
@@ -47,7 +48,7 @@ def in_order(photos: list[np.ndarray]) -> tuple[list[np.ndarray], list[Assignmen
     return [photos[ORDER.index(place)] for place in range(VIEWS)], [Assignment(place, 0) for place in ORDER]
 
 
-@pytest.mark.parametrize("exact", [True, False])
+@sweep("exact", [True, False])
 def test_photos_find_their_views_in_any_order(views: np.ndarray, photos: list[np.ndarray], exact: bool) -> None:
     pool, expected = in_order(photos)
     assert assign(views, pool, range(VIEWS), exact=exact) == expected
@@ -76,7 +77,7 @@ def test_a_neighbour_stands_for_no_missing_photo(views: np.ndarray, photos: list
     assert assign(views, pool, neighbour, exact=exact)[2] is None
 
 
-@pytest.mark.parametrize("named", [list(range(VIEWS)), [None] * VIEWS])
+@sweep("named", [list(range(VIEWS)), [None] * VIEWS])
 def test_photos_of_another_place_show_nothing(named: Named, views: np.ndarray, others: list[np.ndarray]) -> None:
     assert assign(views, others, named, exact=True) == [None] * VIEWS
 
@@ -87,6 +88,7 @@ def test_photo_of_noise_is_left_out(views: np.ndarray, photos: list[np.ndarray])
     assert [view for view, each in enumerate(assign(views, pool, range(VIEWS), exact=True)) if each is None] == [3]
 
 
+@pytest.mark.slow
 def test_frames_of_a_film_that_show_the_views_are_found(views: np.ndarray, photos: list[np.ndarray]) -> None:
     """Of many frames a sample is compared; the film dwells on each view."""
     film = [shrunk(photos[frame * VIEWS // (2 * FIRST_PHOTOS)][None], 64)[0] for frame in range(2 * FIRST_PHOTOS)]
@@ -142,6 +144,7 @@ def test_photo_is_displaced_where_its_parts_lie_farther_off_than_others(
     assert [view for view in given if assigner.is_displaced(view, given)] == elsewhere
 
 
+@pytest.mark.slow
 def test_exchanged_photos_of_which_some_lie_on_their_side(views: np.ndarray, photos: list[np.ndarray]) -> None:
     """A photo may be more like another view in another turn than that of its tag."""
     pool, expected = in_order(photos)

@@ -156,6 +156,7 @@ def test_the_number_of_threads_does_not_change_a_cut(
     np.testing.assert_array_equal(cut(1).x, cut(3).x)
 
 
+@pytest.mark.slow
 def test_a_long_fit_with_edges_reaches_less_beyond_its_photos(truth: Gaussians, photos: Pair) -> None:
     """Of one seed few Gaussians decide, so that four are taken, and lengths in place of their squares."""
     edges, reach = edges_of(photos[1], 2.0), np.zeros(2)

@@ -155,6 +155,7 @@ def test_large_photos_count_in_every_pixel(scene: Scene) -> None:
     assert all((weight == 1).all() for weight in run.step_weights[2])
 
 
+@pytest.mark.slow
 def test_a_fit_to_larger_photos_shows_them_better(truth: Gaussians, scene: Scene) -> None:
     """Over three seeds, since by one the gain is .2 to .9 dB."""
     large, start = with_large(scene, 2), scenes.spoil(truth)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import scenes
 from messages import noted, refuses
+from sweeps import sweep
 
 from gsmerge import CompactOptions, Gaussians, Scene, compact, render
 from gsmerge.errors import UsageError
@@ -124,6 +125,7 @@ def test_a_budget_is_met_after_the_crop(scene: Scene, share: float) -> None:
     assert sum("clean-up: " in note for note in result.report.notes) == 1
 
 
+@pytest.mark.slow
 def test_cropped_fit_shows_the_inside_better_than_cropping_afterwards(scene: Scene) -> None:
     """The same number of Gaussians shows the inside better than where all was fitted and then cut, over two seeds."""
     crop, fitted = sphere_in(scene, 0.5), QUICK | {"fit": "full", "fit_steps": 80}
@@ -145,7 +147,7 @@ def test_cropped_fit_shows_the_inside_better_than_cropping_afterwards(scene: Sce
     assert part.report.psnr_after > 20
 
 
-@pytest.mark.parametrize("shape", ["sphere", "box", "turned"])
+@sweep("shape", ["box", "sphere", "turned"])
 def test_what_the_cropped_scene_shows_opaque_stays_opaque(shape: str) -> None:
     """Centres stay inside while they are fitted, so none is cut off afterwards."""
     scene = scenes.make_scene(scenes.room(), scenes.arc(5, 96, 72), noise=0.05)

@@ -117,6 +117,7 @@ def test_scenes_of_one_or_very_many_views_are_not_filled(count: int) -> None:
     assert len(fill(*slit(*np.linspace(-0.6, 0.6, count)))) == 0
 
 
+@pytest.mark.slow
 def test_a_result_that_keeps_all_gaussians_is_filled_as_others_are() -> None:
     scene = scenes.make_scene(scenes.room(), scenes.arc(3, 32, 24), noise=0.01)
     usual, whole = (compact(scene, new_views=False, **more).report for more in ({}, {"min_contribution": 0.0}))

@@ -70,6 +70,7 @@ def test_scenes_are_read_back_aligned(folder: Path, index: int) -> None:
         assert depths[view, own].min() > 0
 
 
+@pytest.mark.slow
 def test_held_out_photos_show_the_same_scene(folder: Path) -> None:
     """Renders of the Gaussians are nearer to the held-out photos than those photos are to one another's places."""
     better = []

@@ -53,6 +53,7 @@ def capture_of(scene: Scene, backbone: DepthBackbone) -> Capture:
     return Capture(Views(scene.cameras, scene.images, scene.names), backbone, "room")
 
 
+@pytest.mark.slow
 def test_networks_train_on_what_a_backbone_predicts_for_drawn_views(scene: Scene, tmp_path: Path) -> None:
     backbone = DepthBackbone(scene)
     options = replace(OPTIONS, steps=2, save_every=2, random_views=(1, 12))
