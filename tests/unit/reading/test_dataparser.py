@@ -151,6 +151,7 @@ def test_a_dataparser_file_that_does_not_help_is_not_applied(tmp_path: Path) -> 
     assert np.allclose(loaded.scene.cameras.viewmats, SMOOTH.w2c)
 
 
+@pytest.mark.slow
 def test_cameras_of_the_capture_are_refused_without_the_dataparser_file(tmp_path: Path) -> None:
     save_trained(tmp_path)
     write_colmap_text(tmp_path / "sparse", SMOOTH)

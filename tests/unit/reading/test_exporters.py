@@ -88,6 +88,7 @@ def test_world_moved_by_any_similarity_is_followed(tmp_path: Path, smooth: Tiny,
     assert len(loaded.scene.gaussians) == layers * len(smooth.gaussians)
 
 
+@pytest.mark.slow
 def test_a_wrong_camera_costs_its_view_alone(small_scene: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(small_scene, tmp_path / "scene"))
     with edited_json(folder / "transforms.json") as data:

@@ -159,6 +159,7 @@ def test_options_that_bring_cameras_are_named_for_the_model(tmp_path: Path, name
     assert bool(option) == bool(said)
 
 
+@pytest.mark.slow
 def test_a_scene_without_cameras_says_what_brings_them(tmp_path: Path) -> None:
     MODELS["nerfstudio"](tmp_path / "out")
     shutil.copy(tmp_path / "out/splat.ply", tmp_path / "splat.ply")

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from exports import export_rows, save_export, smooth_scene
 from messages import names, noted, refuses
+from sweeps import sweep
 from tiny_scene import Tiny
 
 from gsmerge.errors import SceneError
@@ -296,7 +297,7 @@ def test_grey_edges_of_a_mask_change_no_dark_pixel(tiny_folder: Path, tiny: Tiny
     assert (importance[0, :, tiny.width // 2 - 1] < 1).all()
 
 
-@pytest.mark.parametrize("ending", [".png", ".jpg"])
+@sweep("ending", [".jpg", ".png"])
 @pytest.mark.parametrize("kind", PICTURES)
 def test_photos_in_place_of_masks_are_refused(tmp_path: Path, kind: str, ending: str) -> None:
     """By their colours, or where greys change as those of the photo do; found beside the scene, they are left out."""

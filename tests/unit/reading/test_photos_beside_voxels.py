@@ -14,6 +14,7 @@ from messages import names
 from PIL import Image
 from plyfile import PlyData
 from shared import write_scene
+from sweeps import sweep
 from tiny_scene import write_images
 
 from gsmerge.reading.read_scene import load_scene
@@ -42,8 +43,8 @@ def add_thumbnails(images: Path) -> None:
         cv2.imwrite(str(images / ".thumb" / path.name), cv2.resize(cv2.imread(str(path)), (24, 16)))
 
 
-@pytest.mark.parametrize(
-    ("change", "shown"), [(store_on_the_side, [0, 1, 2, 3]), (delete_one, [0, 2, 3]), (add_thumbnails, [0, 1, 2, 3])]
+@sweep(
+    ("change", "shown"), [(delete_one, [0, 2, 3]), (store_on_the_side, [0, 1, 2, 3]), (add_thumbnails, [0, 1, 2, 3])]
 )
 def test_photos_beside_gaussians_of_no_pixels(tmp_path: Path, change: Callable[[Path], None], shown: list[int]) -> None:
     """Only what is missing is left out, with its name."""

@@ -391,6 +391,7 @@ def test_cameras_and_photos_in_odd_places_are_found_with_a_note(
     assert noted(described["notes"], *said)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("make", "cameras", "other"),
     [(large_astray, "colmap/sparse/1", "colmap/sparse/0 (6"), (astray_transforms, "distorted/sparse/0", "transforms")],
@@ -403,6 +404,7 @@ def test_cameras_that_fit_precede_those_that_do_not(
     assert noted(loaded.notes, f"read from {cameras}", other)
 
 
+@pytest.mark.slow
 def test_cameras_below_that_no_photo_confirms_are_named(tmp_path: Path) -> None:
     loaded = load(tmp_path, "voxels", below_astray)
     assert loaded.files.cameras is None

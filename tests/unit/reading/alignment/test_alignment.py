@@ -113,6 +113,7 @@ def test_rows_without_finite_positions_do_not_decide_the_reading(tmp_path: Path,
     assert load_scene(folder, order="view-major").scene.pixels.shown.sum() == 839
 
 
+@pytest.mark.slow
 def test_poses_that_fit_in_no_reading_are_refused(tmp_path: Path) -> None:
     folder = some_rows(SMOOTH).save(tmp_path / "scene")
     away = SMOOTH.c2w.copy()

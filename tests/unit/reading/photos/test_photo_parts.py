@@ -56,6 +56,7 @@ def test_a_part_that_fits_is_cut_out(tmp_path: Path, name: str) -> None:
     assert np.abs(images * 255 - SMOOTH.images).mean() < 6
 
 
+@pytest.mark.slow
 def test_photos_of_which_no_part_fits_are_left_out(tmp_path: Path) -> None:
     write_photos(tmp_path, lambda i: np.hstack([other(i), other(i)]))
     loaded = load_scene(tmp_path)
