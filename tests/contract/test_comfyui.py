@@ -107,6 +107,7 @@ def test_splats_are_fitted_to_images(nodes: ModuleType, scene: gsmerge.Scene) ->
         nodes.CompactGaussians.execute([splat], ["300"], ["draft"], images)
 
 
+@pytest.mark.slow
 def test_batches_are_compacted_one_by_one(nodes: ModuleType, scene: gsmerge.Scene) -> None:
     batch = make_splat(scene.gaussians[::2], scene.gaussians[::3])
     (result, alone), reports = nodes.CompactGaussians.execute(

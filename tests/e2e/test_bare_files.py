@@ -75,6 +75,7 @@ def test_other_commands_need_no_hint_for_a_bare_file(words: str, bare: Path, tmp
     assert sum(noted([note], *expected) for note in notes) == 1
 
 
+@pytest.mark.slow
 def test_counts_are_judged_by_views_that_nothing_was_fitted_to(bare: Path, tmp_path: Path, run: Any) -> None:
     report = report_of(run, "compact", bare, "-o", tmp_path / "a.ply", "--quality", "22dB", "--effort", "fast")
     assert report["choices"]["search"]["met"]
@@ -110,6 +111,7 @@ def test_photos_are_used_with_order_none_where_cameras_are_known(
     assert report["psnr_input_views"]["after"] is not None
 
 
+@pytest.mark.slow
 def test_draft_notes_that_it_has_no_fit(bare: Path, tmp_path: Path, run: Any) -> None:
     draft, fast = (
         report_of(run, "compact", bare, "-o", tmp_path / f"{effort}.ply", "--budget", "20%", "--effort", effort)
@@ -120,6 +122,7 @@ def test_draft_notes_that_it_has_no_fit(bare: Path, tmp_path: Path, run: Any) ->
     assert fast["choices"]["fidelity"]["psnr"] > draft["choices"]["fidelity"]["psnr"]
 
 
+@pytest.mark.slow
 def test_inspect_bounds_what_compact_writes(bare: Path, tmp_path: Path, run: Any) -> None:
     """A plan does not search, which is most of the run."""
     report = report_of(run, "compact", bare, "-o", tmp_path / "a.ply")

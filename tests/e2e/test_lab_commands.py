@@ -51,6 +51,7 @@ def test_stress_prints_json_alone_or_nothing_if_quiet(small_scene: Path, run: Ru
     assert (outcome.out, outcome.err) == ("", "")
 
 
+@pytest.mark.slow
 def test_failed_case_ends_as_a_target_not_met(small_copy: Path, run: Run) -> None:
     poor = ("--set", "fit=none", "--set", "superpixels=1%")
     outcome = run("lab", "stress", small_copy, *poor, "--cases", "order,views-1,unchanged")

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 from shared import write_scene
 
 import gsmerge
@@ -16,6 +17,7 @@ from gsmerge.method.raster.metrics import psnr
 SIGN = slice(20, 34), slice(30, 52)  # of 64 x 96 pixels: 5 %
 
 
+@pytest.mark.slow
 def test_a_protected_part_of_the_photos_is_shown_better(run: Run, tmp_path: Path) -> None:
     room = write_scene(tmp_path / "room", num_views=3, width=96, height=64, seed=0)
     scene, after = gsmerge.read_scene(room), []
@@ -58,6 +60,7 @@ def test_a_protected_part_of_the_photos_is_shown_better(run: Run, tmp_path: Path
     assert any(note.startswith("protect: ") for note in report["notes"])
 
 
+@pytest.mark.slow
 def test_a_batch_takes_no_masks_of_other_scenes(run: Run, tmp_path: Path) -> None:
     """A scene called masks and a folder of grey masks beside it change no bytes; the folder is named."""
     quick = ("--effort", "draft", "--set", "fit=none")

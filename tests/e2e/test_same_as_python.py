@@ -93,6 +93,7 @@ def test_a_file_that_changes_while_it_is_read_is_refused(smallest_copy: Path, mo
     assert not out.exists()
 
 
+@pytest.mark.slow
 def test_file_that_broke_off_is_a_doubt_of_every_command(smallest_copy: Path, run: Run) -> None:
     """The last 60 % of it are zeros."""
     ply, out = smallest_copy / "scene.ply", smallest_copy.parent / "out"

@@ -37,6 +37,7 @@ def sharp(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_several_files_become_one_scene(run: Run, sharp: Path, tmp_path: Path) -> None:
     """Three photos are matched and joined, and the result is fitted, which takes two seconds."""
     out, photos = tmp_path / "place.ply", sharp / "photos"

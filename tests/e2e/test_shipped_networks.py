@@ -15,6 +15,7 @@ from gsmerge.method.networks.checkpoint import SHIPPED
 LEAST_GAIN = 1.0  # dB on photos that the scene was not made from
 
 
+@pytest.mark.slow
 def test_shipped_networks_gain_without_a_fit(tmp_path: Path) -> None:
     """Over the analytic stages, on a scene that nobody trained on."""
     made = write_scene(tmp_path / "scene", num_views=4, width=128, height=96, seed=123)

@@ -66,6 +66,7 @@ def test_budget_beyond_the_scene_makes_no_more_gaussians_than_it_has(scene: Scen
     assert not noted(compact(scene, budget=200, fit="none").report.notes, "200")
 
 
+@pytest.mark.slow
 def test_sizes_and_shares_limit_the_automatic_count(tmp_path: Path, run: Run) -> None:
     """No more Gaussians are taken than new views gain from, unless all are asked for; a number is met exactly."""
     scene = write_scene(tmp_path / "scene", num_views=5, width=24, height=16)

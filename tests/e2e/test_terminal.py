@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 from messages import ERROR
+from sweeps import sweep
 
 from gsmerge.runtime.documents import wrap_line
 
@@ -91,12 +92,13 @@ def test_compact_ends_with_a_table_of_its_result(small_copy: Path, tmp_path: Pat
     assert "/17" not in output.decode()
 
 
-@pytest.mark.parametrize(
+@sweep(
     ("kind", "words"),
     [
         *product(["xterm"], ["--help", "compact --help", "lab --help", "compact", "inspect {scene}"]),
-        *product(["", "dumb", "unknown"], ["compact --help", "inspect {scene}"]),
+        *product(["dumb", "", "unknown"], ["compact --help", "inspect {scene}"]),
     ],
+    often=7,
 )
 def test_lines_fit_a_narrow_terminal_of_any_kind(kind: str, words: str, small_scene: Path) -> None:
     """Nothing is wider than it, and one without a known name gets no escape sequences."""

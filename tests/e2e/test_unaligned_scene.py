@@ -67,10 +67,10 @@ def forget(folder: Path) -> None:
         del data["frames"][1:]
 
 
-@pytest.mark.parametrize(
+@sweep(
     ("harm", "kind", "words"),
-    [(scale, "voxels", ("another scale", "--hint")), (shift, "voxels", ("moved by",)),
-     (forget, "grid", ("no camera", "transforms.json"))],
+    [(forget, "grid", ("no camera", "transforms.json")), (scale, "voxels", ("another scale", "--hint")),
+     (shift, "voxels", ("moved by",))],
 )  # fmt: skip
 def test_cameras_that_contradict_the_gaussians_cost_nothing(
     harm: Callable[[Path], None],
@@ -95,7 +95,7 @@ def test_cameras_that_contradict_the_gaussians_cost_nothing(
 
 
 # Which other views judge; of those that are placed, seeds differ by 1.4 dB
-@pytest.mark.parametrize(("beside", "least"), [("cameras", 30), ("nothing", 27)])
+@sweep(("beside", "least"), [("cameras", 30), ("nothing", 27)])
 def test_a_result_compacted_again_looks_as_it_did(
     compacted_scene: Path, beside: str, least: float, tmp_path: Path, run: Run
 ) -> None:

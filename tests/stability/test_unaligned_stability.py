@@ -114,6 +114,7 @@ def test_scene_without_cameras_reaches_the_floor(room: Scene, floor: Callable[..
     floor(scenes.psnr_of(result.gaussians, replace(room, images=own)))
 
 
+@pytest.mark.slow
 def test_cameras_are_placed_as_well_far_from_the_origin(room: Scene) -> None:
     """In geographic coordinates cameras are placed as well as at home."""
     g, shift = room.gaussians, np.array([1e6, -3e6, 400.0])
