@@ -29,8 +29,7 @@ GENERATORS = ("docs/generate_reference.py", "docs/one_run.py", "docs/packages.py
 TASKS: dict[str, tuple[tuple[str, ...], ...]] = {  # the calls of each task
     "demo": (MAKE_VENV, (*INSTALL, "."), *MAIN_JOB),
     "main-job": MAIN_JOB,  # the demo with a package that is installed already
-    # most files of so many packages are never imported; Python compiles the others at their first import
-    "setup": (MAKE_VENV, (*INSTALL, ".[test,site]", "--no-compile")),
+    "setup": (MAKE_VENV, (*INSTALL, ".[test,site]")),
     "native": (("python", "gsmerge/method/kernels/build.py"),),
     "tests": (("python", "-m", "pytest"),),
     "sweeps": (("python", "-m", "pytest", "-m", "slow"),),
