@@ -46,7 +46,7 @@ FACTORS = 2.0 ** np.linspace(0, 3, 13)  # candidate depths, relative to the dept
 FARTHEST_QUANTILE = 0.99  # quantile of the depths that counts as the farthest
 HOLE_NEIGHBORS = 3  # number of nearest views that a picture is compared with
 DIFFERENCE_BLUR = 3.0  # standard deviation in pixels of the window over which differences are averaged
-SAMPLE = 4  # of as many lines and columns of a view one is sampled where medians of depths are needed
+SAMPLE = 10_000  # pixels of a view that are enough for medians of depths; few Gaussians are all used
 BARE = 0.02  # opacity up to which the Gaussian of a pixel shows nothing
 
 
@@ -71,9 +71,10 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = Fa
     holes, empty, edges = np.zeros_like(fillable), np.zeros_like(fillable), dict[int, _Edges]()
     gap = 2 * round(GAP_WIDTH * max(shown.shape[1:]) / 2) + 1
     # Where each pixel has its own Gaussians, a view without an empty part needs to be drawn only at its holes, and
-    # around them if the depth beside them counts
+    # around them if the depth beside them counts. A view of few Gaussians does not know its farthest surface
     around = gap if scene.depths is None else 0
-    parts = {view: tiles_near(fillable[view], around) for view in views if scene.has_own_pixels and not has_empty[view]}
+    knows = (fillable.mean((1, 2)) < MOST_EMPTY) & ~np.array(has_empty) & scene.has_own_pixels
+    parts = {view: tiles_near(fillable[view], around) for view in views if knows[view]}
 
     def find_holes(view: int, tiled: TiledView) -> None:
         """Mark a view's pixels that stay empty, other pixels that its drawing does not cover, and holes to fill."""
@@ -93,10 +94,10 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = Fa
             holes[view] &= cv2.morphologyEx(covered.astype(np.uint8), cv2.MORPH_CLOSE, window) > 0
         if covered.any() and holes[view].any():
             beside = fill_gaps(depths[..., None], covered)[..., 0]
-            own_depths = _measure_fronts(scene, view)
-            known = _fit_map(scene, view, own_depths)
-            surfaces = own_depths[np.isfinite(own_depths)] if view in parts else depths[covered]
-            (farthest,) = quantiles(surfaces, [FARTHEST_QUANTILE]) if surfaces.size else (0.0,)
+            pixels, own_depths = _sample_fronts(scene, view)
+            known = _fit_map(scene, view, pixels, own_depths)
+            surfaces = own_depths if view in parts and own_depths.size else depths[covered]
+            (farthest,) = quantiles(surfaces, [FARTHEST_QUANTILE])
             edges[view] = _Edges(beside[holes[view]], float(farthest), None if known is None else known[holes[view]])
 
     tile_views(scene, find_holes, views, parts)
@@ -163,25 +164,27 @@ class _Edges:
     known: np.ndarray | None = None  # [n] depth of each hole in the view's depth map, NaN without one
 
 
-def _measure_fronts(scene: PicturedScene, view: int) -> np.ndarray:
-    """Return the depth of the Gaussian in front at one pixel of SAMPLE x SAMPLE of a view; NaN where there is none."""
-    fronts = scene.get_pixels().fronts[view, ::SAMPLE, ::SAMPLE]
-    means = scene.gaussians.means[np.maximum(fronts, 0)].astype(np.float64)
-    return np.where(fronts >= 0, camera_depths(means, scene.cameras.viewmats[view]), np.nan)
+def _sample_fronts(scene: PicturedScene, view: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return pixels ``[p]`` of a view that have a Gaussian, at most about SAMPLE, and the depths ``[p]`` of these."""
+    fronts = scene.get_pixels().fronts[view].reshape(-1)
+    pixels = np.flatnonzero(fronts >= 0)
+    pixels = pixels[:: 1 + len(pixels) // SAMPLE]
+    means = scene.gaussians.means[fronts[pixels]].astype(np.float64)
+    return pixels, camera_depths(means, scene.cameras.viewmats[view])
 
 
-def _fit_map(scene: PicturedScene, view: int, own_depths: np.ndarray) -> np.ndarray | None:
+def _fit_map(scene: PicturedScene, view: int, pixels: np.ndarray, own_depths: np.ndarray) -> np.ndarray | None:
     """Bring a view's depth map to the unit of the scene; return ``[h,w]``, NaN where it has no depth.
 
-    None without a map, or if the map explains the ``own_depths`` of the view's Gaussians, see :func:`_measure_fronts`,
-    no better than one depth for all of them does: it does not belong to the view.
+    None without a map, or if the map explains the ``own_depths [p]`` of Gaussians at ``pixels [p]`` no better than one
+    depth for all of them does: it does not belong to the view.
     """
     if scene.depths is None:
         return None
     known = scene.depths[view].astype(np.float64)
     known[~(np.isfinite(known) & (known > 0))] = np.nan
-    sample = known[::SAMPLE, ::SAMPLE]
-    both = np.isfinite(own_depths) & np.isfinite(sample)
+    sample = known.reshape(-1)[pixels]
+    both = np.isfinite(sample)
     if not both.any():
         return None
     depths = own_depths[both]
