@@ -295,9 +295,10 @@ def _describe_hidden(scene: PicturedScene, hidden: np.ndarray, views: Sequence[i
     if not with_hidden:
         return ""
     max_percent = 100 * max(float(hidden[view].mean()) for view in with_hidden)
+    percent = f"{max_percent:.2g}" if max_percent < 10 else f"{max_percent:.0f}"
     return (
         f"{len(with_hidden)} of {len(views)} photos differ in part from their Gaussians"
-        f" (up to {max_percent:.2g} % of a photo; perhaps a mask, a mark, a finger, another look or camera):"
+        f" (up to {percent} % of a photo; perhaps a mask, a mark, a finger, another look or camera):"
         f" the Gaussians' colours are used there ({list_some([scene.names[view] for view in with_hidden])};"
         " --set look=scene uses them everywhere)"
     )

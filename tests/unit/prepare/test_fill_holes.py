@@ -219,6 +219,20 @@ def test_depth_maps_of_the_model_fill_what_it_dropped(tmp_path: Path) -> None:
     np.testing.assert_array_equal(wrong, guessed)
 
 
+def test_a_depth_map_counts_where_few_gaussians_tell_its_unit() -> None:
+    """In a view that has lost nearly all of them."""
+    scene = make_walls()
+    maps = 1.7 * depths_of(filled_everywhere(scene))
+    kept = scene.pixels.shown.copy()
+    kept[1] = False
+    kept[1].reshape(-1)[np.flatnonzero(scene.pixels.shown[1])[::100]] = True
+    few = replace(scenes.shown_in(scene, kept), depths=maps)
+    filled = filled_everywhere(few)
+    new = new_in(filled, few)[1]
+    assert new.mean() > 0.3
+    assert np.median(np.abs(np.log(1.7 * depths_of(filled)[1][new] / maps[1][new]))) < 0.01
+
+
 LOST: dict[str, tuple[Callable[[np.ndarray], None], float]] = {  # changes of rows [v,h,w], and dB that they may cost
     "some placeholders": (lambda rows: rows.reshape(-1)[::97].fill(0), 0.3),
     "a strip times a mask": (lambda rows: rows[:, :, :12].fill(0), 0.3),
