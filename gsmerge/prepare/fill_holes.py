@@ -64,7 +64,7 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = Fa
     beyond = scene.beyond
     fillable = shown & (fronts < 0)  # pixels with a picture and without a Gaussian
     bare = find_bare(scene)
-    has_empty = [is_cropped or (not everywhere and bool(large_parts(part).any())) for part in bare]
+    has_empty = np.array([is_cropped or (not everywhere and large_parts(part).any()) for part in bare])
     views = [view for view in range(len(scene)) if has_empty[view] or fillable[view].any()]
     if not views:
         return scene
@@ -73,7 +73,7 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = Fa
     # Where each pixel has its own Gaussians, a view without an empty part needs to be drawn only at its holes, and
     # around them if the depth beside them counts. A view of few Gaussians does not know its farthest surface
     around = gap if scene.depths is None else 0
-    knows = (fillable.mean((1, 2)) < MOST_EMPTY) & ~np.array(has_empty) & scene.has_own_pixels
+    knows = scene.has_own_pixels & ~has_empty & (fillable.mean((1, 2)) < MOST_EMPTY)
     parts = {view: tiles_near(fillable[view], around) for view in views if knows[view]}
 
     def find_holes(view: int, tiled: TiledView) -> None:

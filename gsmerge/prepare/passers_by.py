@@ -12,7 +12,6 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from gsmerge.arrays import distinct
 from gsmerge.frozen import dataclass, replace
 from gsmerge.method.compare.view_pictures import fit_size
 from gsmerge.method.geometry.transforms import camera_depths, median, nearest_views, project
@@ -145,7 +144,7 @@ def _find_part(own: SmallView, others: Sequence[SmallView]) -> np.ndarray:
     # views see through them
     near = cv2.dilate(core.astype(np.uint8), REACH) > 0
     _, labels = cv2.connectedComponents((core | (seen_through & near)).astype(np.uint8), connectivity=4)
-    whole = np.isin(labels, distinct(labels[core]))
+    whole = np.isin(labels, labels[core])
     return np.asarray(cv2.morphologyEx(whole.astype(np.uint8), cv2.MORPH_CLOSE, SQUARE_5) > 0)
 
 

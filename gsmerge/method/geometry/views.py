@@ -15,7 +15,7 @@ from gsmerge.types import PER_PIXEL, Cameras, Pixels, SceneT
 
 MAX_SCORED_VIEWS = 24  # largest number of scored views if a decision depends on the score
 # Largest number of scored views if only the report needs the score. On fifteen captures, the gain on samples of six
-# views differs from that on all whole photos by .31 dB (rms); with eight by .33, with five by .73, with four by .67
+# views differs from that on all whole photos by .31 dB (rms); with eight by .33, with four by .67, with three by .72
 REPORT_VIEWS = 6
 BY_VIEW = ("cameras", "large_photos", "empty", *PER_PIXEL)  # fields of a scene that have an entry for each view
 
