@@ -121,6 +121,8 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
     limits, settings = plan.count.limits, plan.settings
     num_pixels = max(limits.num_pixels, scene.num_gaussians)
     max_count = num_pixels if options.method.startswith("unmerged") else limits.count or limits.default
+    if size.has_own_pixels and options.method == OURS and not (limits.count or plan.fit.grows):  # filled pixels count
+        max_count = max(max_count, round(limits.per_view * size.num_views * plan.merge.decode.mean_k))
     no_views = is_without_views(scene, options)
     has_target = plan.count.keeps_fidelity or options.budget.target_psnr is not None
     count = min(scene.num_gaussians or num_pixels, max_count)

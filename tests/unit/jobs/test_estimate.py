@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from exports import export_rows, save_export, smooth_scene
 from made_gaussians import random_gaussians
 
-from gsmerge import CompactOptions
+from gsmerge import CompactOptions, compact
 from gsmerge.counts.curve import curve_counts
 from gsmerge.jobs.estimate import IMPORT_SECONDS, RunCosts, estimate
 from gsmerge.method.facts.scene_size import SceneSize
 from gsmerge.plan.counts import count_limits, level_counts
 from gsmerge.plan.forecast import usual_builds
+from gsmerge.reading.read_scene import load_scene
 from gsmerge.types import Cameras, Scene
 
 VIEW = 480 * 320
@@ -53,3 +56,15 @@ def test_a_file_without_cameras_is_fitted_except_in_a_draft() -> None:
     )
     assert (draft["fit"], asked["fit"], best["fit"]) == ("none", "full", "full")
     assert asked["seconds"] < best["seconds"]
+
+
+def test_a_draft_with_filled_borders_has_no_more_than_the_estimate(tmp_path: Path) -> None:
+    """Filled pixels have superpixels, too, and no fit grows to a number of its own."""
+    tiny = smooth_scene(96, 72)
+    inner = np.zeros((3, 72, 96), bool)
+    inner[:, 10:-10, 12:-12] = True
+    scene = load_scene(save_export(tmp_path, tiny, export_rows(tiny, np.flatnonzero(inner)))).scene
+    settings = {"effort": "draft", "match": "none"}
+    run, result = estimate(scene, CompactOptions().with_settings(settings)), compact(scene, **settings)
+    rows = len(scene.gaussians)
+    assert int(0.044 * rows) < len(result.gaussians) <= run["num_gaussians"] < 0.1 * rows
