@@ -22,7 +22,7 @@ from gsmerge.method.raster import TiledView
 from gsmerge.method.raster.composite import blend_depths
 from gsmerge.method.raster.images import tile_views, tiles_near
 from gsmerge.prepare.photo_change import PhotoChange, change_large
-from gsmerge.runtime.record import note
+from gsmerge.runtime.record import list_some, note
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Gaussians, PicturedScene
 
@@ -101,6 +101,10 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = Fa
             edges[view] = _Edges(beside[holes[view]], float(farthest), None if known is None else known[holes[view]])
 
     tile_views(scene, find_holes, views, parts)
+    refused = [scene.names[view] for view in sorted(edges) if edges[view].known is None]
+    if scene.depths is not None and refused:
+        why = "the depths of their views' Gaussians do not confirm them"
+        note(f"the depth maps of {len(refused)} of {len(scene)} views are not used: {why} ({list_some(refused)})")
     if edges and np.count_nonzero(bare[views]) < MOST_EMPTY * np.count_nonzero(~empty[views]):
         ids = sorted(edges)
         added = Gaussians.concat(parallel_map(lambda view: _fill_view(scene, view, holes[view], edges[view]), ids))

@@ -194,9 +194,11 @@ def add_larger_and_masks(load: Loaded) -> Loaded:
     if scene.masks is not None:  # some views have no photo, and none of their pixels count
         counts = scene.masks if counts is None else counts & scene.masks
     maps = source.camera_file.depths  # of the model, which saw the views at their own size
-    depths = (
-        maps if maps is not None and maps.shape == (len(scene), scene.cameras.height, scene.cameras.width) else None
-    )
+    shape = len(scene), scene.cameras.height, scene.cameras.width
+    depths = maps if maps is not None and maps.shape == shape and maps.dtype.kind == "f" else None
+    if maps is not None and depths is None:
+        found = f"{maps.dtype} {list(maps.shape)}, expected floats {list(shape)}, those of the views"
+        notes.append(f"the depth maps in {source.camera_file.path} are not used to fill holes: found {found}")
     scene = replace(scene, large_photos=large, masks=counts, importance=masks.importance, depths=depths)
     notes = [*load.notes, *notes, *mask_notes, *check_notes]
     return replace(load, scene=scene, source=None, notes=tuple(notes), candidates=tuple(choices))

@@ -81,7 +81,7 @@ class CameraFile:
     lenses: tuple[Lens | None, ...] = ()  # of each camera, None for a pinhole; empty if all are pinholes
     masks: Mapping[str, str] = field(default_factory=dict)  # name of an image -> name of its mask
     counts: np.ndarray | None = None  # ``[c,h,w]`` bool, where images inside the file count; None: everywhere
-    depths: np.ndarray | None = None  # ``[c,h,w]`` depth maps of the cameras, in any unit; None: the file holds none
+    depths: np.ndarray | None = None  # depth maps in any unit, ``[c,h,w]`` if they are of these cameras; None: no maps
     has_intrinsics: bool = True  # False: the file has only poses, and `Ks` are placeholders
     # Size of the photos, and the transform from the photos' size to the cameras' size. None before the photos are known
     photo_map: tuple[Size, PhotoTransform] | None = None
@@ -275,7 +275,10 @@ def select_views(cameras: CameraFile, view_ids: Sequence[int]) -> CameraFile:
     ids = list(view_ids)
     lenses = tuple(cameras.lenses[i] for i in ids) if cameras.lenses else ()
     arrays = {name: getattr(cameras, name)[ids] for name in ("viewmats", "Ks", "widths", "heights")}
-    arrays |= {name: kept[ids] for name in ("counts", "depths") if (kept := getattr(cameras, name)) is not None}
+    for name in ("counts", "depths"):
+        values = getattr(cameras, name)
+        if values is not None and values.shape[:1] == (len(cameras),):  # another number of maps is not of these views
+            arrays[name] = values[ids]
     images = cameras.images[ids] if isinstance(cameras.images, np.ndarray) else cameras.images
     names = tuple(cameras.names[i] for i in ids)
     return replace(cameras, **arrays, names=names, images=images, lenses=lenses if any(lenses) else ())

@@ -64,7 +64,7 @@ class StoredCameras(NamedTuple):
     order: str = "auto"  # order of the Gaussians' rows
     convention: Convention | None = None  # convention of the poses if it differs from that of the format
     counts: np.ndarray | None = None  # ``[c,h,w]`` bool, where ``images`` count; None: everywhere
-    depths: np.ndarray | None = None  # ``[c,h,w]`` depth maps of the cameras, in any unit
+    depths: np.ndarray | None = None  # depth maps in any unit, ``[c,h,w]`` if they are of these cameras
 
 
 @contextmanager

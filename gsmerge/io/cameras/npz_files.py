@@ -80,9 +80,8 @@ def read_da3(source: CameraSource) -> StoredCameras:
         height = round(2 * Ks[0, 1, 2])
     if width <= 1 and Ks is not None and not is_da3(path):  # AnySplat divides intrinsics by the size
         return StoredCameras(_make_views(poses, Ks, (0, 0)), photos, convention=C2W_OPENCV)
-    shape = len(poses), height, width
-    if depths is not None:  # others than maps of these views fill no holes
-        depths = depths.reshape(shape) if depths.dtype.kind == "f" and depths.size == math.prod(shape) else None
+    if depths is not None and depths.size == math.prod((len(poses), height, width)):
+        depths = depths.reshape(len(poses), height, width)
     return StoredCameras(_make_views(poses, Ks, (width, height)), photos, depths=depths)
 
 

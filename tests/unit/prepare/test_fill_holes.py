@@ -24,6 +24,7 @@ from gsmerge.prepare.fill_holes import LARGE_SIDE, RIM_PIXELS, fill_holes, large
 from gsmerge.prepare.prepare_scene import prepare
 from gsmerge.prepare.true_pixels import with_pixels
 from gsmerge.reading.read_scene import load_scene
+from gsmerge.runtime.record import record_run
 from gsmerge.types import Cameras, Gaussians, PicturedScene, Pixels
 
 WIDTH, HEIGHT, NEAR, FAR, FLOOR = 96, 64, 3.0, 6.0, 24
@@ -194,7 +195,8 @@ def test_shares_of_a_budget_do_not_count_filled_gaussians() -> None:
 
 
 def test_depth_maps_of_the_model_fill_what_it_dropped(tmp_path: Path) -> None:
-    """In whatever unit they are. A map that does not belong to the views, or has no depth, changes nothing."""
+    """In whatever unit they are. A map that does not belong to the views, or has no depth, is named and not used."""
+    named = list[bool]()
     tiny = smooth_scene(96, 72)
     folder = save_export(tmp_path, tiny, export_rows(tiny, da3_rows(tiny)), cameras=False)
     dropped = ~np.isin(np.arange(tiny.depths.size), da3_rows(tiny)).reshape(tiny.depths.shape)
@@ -202,7 +204,9 @@ def test_depth_maps_of_the_model_fill_what_it_dropped(tmp_path: Path) -> None:
     def errors_of(maps: np.ndarray) -> np.ndarray:
         """Return by which share the depths of what is filled differ from the truth."""
         write_npz(folder / "results.npz", tiny, depth=maps.astype(np.float32))
-        prepared = prepare(load_scene(folder).scene)
+        with record_run() as record:
+            prepared = prepare(load_scene(folder).scene)
+        named.append(noted(record.notes, "3 of 3 views", *prepared.scene.names))
         scene, found = prepared.scene, []
         assert scene.depths is None
         for view, fronts in enumerate(scene.get_pixels().fronts):
@@ -217,6 +221,7 @@ def test_depth_maps_of_the_model_fill_what_it_dropped(tmp_path: Path) -> None:
     )
     assert np.median(right) < 0.01 < np.median(guessed)
     np.testing.assert_array_equal(wrong, guessed)
+    assert named == [False, True, True]
 
 
 def test_a_depth_map_counts_where_few_gaussians_tell_its_unit() -> None:

@@ -32,7 +32,8 @@ from sweeps import sweep
 from tiny_scene import Tiny, edited_json, rotation, save_json, write_colmap_text, write_images, write_inria, write_npz
 
 from gsmerge.errors import SceneError
-from gsmerge.io import read_ply
+from gsmerge.io import read_cameras, read_ply
+from gsmerge.io.cameras.camera_file import select_views
 from gsmerge.reading.read_scene import load_scene, read_scene
 
 
@@ -189,6 +190,25 @@ def test_gaussians_in_a_predicted_world_follow_the_user_s_cameras(tmp_path: Path
     same = np.abs(of_pixels(scene, "opacities") - tiny.gaussians.opacities) < 1e-5
     assert same[da3_rows(tiny)].mean() > 0.99
     assert loaded.alignment.worst_px < 0.5
+
+
+def test_depth_maps_that_are_not_used_are_named(tmp_path: Path) -> None:
+    """Maps of another size, another number or another kind; the views may be chosen in another order."""
+    tiny = smooth_scene(96, 72)
+    save_export(tmp_path / "gs_ply", tiny, export_rows(tiny), cameras=False, name="0000.ply")
+    path = tmp_path / "exports/npz/results.npz"
+    maps = tiny.depths.astype(np.float32)
+    others = {"[3, 36, 48]": maps[:, ::2, ::2], "[2, 72, 96]": maps[:2], "uint16": (1000 * maps).astype(np.uint16)}
+    for found, depth in others.items():
+        write_npz(path, tiny, depth=depth)
+        loaded = load_scene(tmp_path)
+        assert loaded.scene.depths is None
+        assert noted(loaded.notes, path, found, "[3, 72, 96]")
+        select_views(read_cameras(path), [2, 0])  # raises nothing
+    write_npz(path, tiny, depth=maps)
+    loaded = load_scene(tmp_path)
+    assert loaded.scene.depths is not None
+    assert not noted(loaded.notes, path, "[3, 72, 96]")
 
 
 def test_arrays_as_the_demo_names_them_are_cameras_and_photos(tmp_path: Path) -> None:
