@@ -25,7 +25,7 @@ from gsmerge.prepare.draw_left_out import draw_left_out, mask_background
 from gsmerge.prepare.draw_outside import draw_outside
 from gsmerge.prepare.edits import follow_edits
 from gsmerge.prepare.exposure import equalise_exposure
-from gsmerge.prepare.fill_holes import fill_holes
+from gsmerge.prepare.fill_holes import MOST_EMPTY, fill_holes
 from gsmerge.prepare.masked_rows import drop_masked
 from gsmerge.prepare.move_poses import move_poses
 from gsmerge.prepare.overlays import leave_out_overlays
@@ -34,7 +34,7 @@ from gsmerge.prepare.repeats import without_repeats
 from gsmerge.prepare.row_colors import add_row_colors
 from gsmerge.prepare.true_pixels import raise_sizes, with_pixels
 from gsmerge.prepare.vignette import divide_by_vignette
-from gsmerge.runtime.record import note, record_choices
+from gsmerge.runtime.record import list_some, note, record_choices
 from gsmerge.settings.stages import PrepareOptions
 from gsmerge.types import PicturedScene, Scene
 
@@ -261,7 +261,11 @@ def fill_scene(p: Prepared, options: PrepareOptions) -> Prepared:
     scene = draw_left_out(replace(filled, depths=None), masks)
     count = len(scene.gaussians) - len(p.scene.gaussians)
     added = f"{count_words(count, 'Gaussian')} added at pixels that no Gaussian covered enough" if count else ""
-    if count and (p.scene.get_pixels().fronts[:, [0, -1]] < 0).all():
+    rows = p.scene.get_pixels().shown
+    few = [name for name, share in zip(scene.names, rows.mean((1, 2)), strict=True) if share < MOST_EMPTY]
+    if count and few:
+        added += f"; fewer than half of the pixels of {list_some(few)} had one"
+    elif count and not rows[:, [0, -1]].any():
         added += ", which is usual: the model left the borders of its pictures out, and perhaps the sky"
     drawn = ""
     if scene.images is not p.scene.images:

@@ -178,6 +178,18 @@ def test_dropped_pixels_are_filled_where_cameras_are_known(tmp_path: Path, photo
     assert np.array_equal(prepared.input_scene.pixels.shown, scene.pixels.shown)
 
 
+def test_a_view_that_lost_its_rows_is_named_among_what_is_filled(tmp_path: Path) -> None:
+    """Its missing rows are no borders that a model left out, also if the other views have no borders."""
+    tiny = smooth_scene(96, 72)
+    kept = da3_rows(tiny)
+    scene = load_scene(save_export(tmp_path, tiny, export_rows(tiny, kept))).scene
+    shown = scene.pixels.shown.copy()
+    shown[1] = False
+    prepared = prepare(scenes.shown_in(PicturedScene.with_pictures(scene, scene.images, None), shown))
+    assert noted(prepared.changes, "Gaussians added", scene.names[1])
+    assert not noted(prepared.changes, "which is usual")
+
+
 def test_views_whose_photos_do_not_show_the_scene_stay_empty() -> None:
     scene = make_walls()
     images = scene.images.copy()
