@@ -12,8 +12,8 @@ from gsmerge.io.bounds import check_file
 from gsmerge.io.cameras.read_cameras import read_cameras
 from gsmerge.io.cameras.table import CAMERA_ENDINGS
 from gsmerge.io.formats import ply, streamed
-from gsmerge.io.formats.read_gaussians import degree_notes
-from gsmerge.io.formats.table import READ_ENDINGS, SCENE_SUFFIXES, STATE, STATE_ENDING, may_hold_gaussians
+from gsmerge.io.formats.read_gaussians import degree_notes, read_gaussians
+from gsmerge.io.formats.table import HTML, READ_ENDINGS, SCENE_SUFFIXES, STATE, STATE_ENDING, may_hold_gaussians
 from gsmerge.io.image_names import IMAGE_SUFFIXES, OTHER_SUFFIXES
 from gsmerge.jobs.states.state_file import holds_features, load_state
 from gsmerge.reading.checkpoint import load_checkpoint
@@ -105,6 +105,8 @@ def _read_other(path: Path) -> FileCheck:
     check_file(path)
     if suffix in SCENE_SUFFIXES:
         find_scene_files(path)  # raises an error that says what a file without Gaussians holds
+    if suffix == HTML.ending:
+        read_gaussians(path)  # raises an error that says what to name in its place
     if suffix in IMAGE_SUFFIXES | OTHER_SUFFIXES:
         raise ply.no_ply_error(path)
     endings = ", ".join(dict.fromkeys((*READ_ENDINGS, *CAMERA_FILE_ENDINGS, NETWORKS)))

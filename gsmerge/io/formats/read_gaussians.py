@@ -179,7 +179,7 @@ def read_gaussians(
     format_ = find_format(path)
     if format_.read is None:
         problem = f"expected one of {', '.join(READ_ENDINGS)}, found {format_.ending}, which is written and not read"
-        raise SceneError(path, problem, "name the file that it was made from")
+        raise SceneError(path, problem, "name the .ply, or the other file of Gaussians, that it was made from")
     if format_.read is ply.read_rows:
         return read_parts([path], opacity=opacity, scales=scales, colors=colors)
     hints = FileHints(opacity=opacity, scales=scales, colors=colors)

@@ -18,7 +18,7 @@ from gsmerge import Compactor, read_scene
 from gsmerge.cli import main
 from gsmerge.drawing.preview import save_picture
 from gsmerge.errors import SceneError
-from gsmerge.io import read_ply, write_gaussians, write_ply
+from gsmerge.io import read_gaussians, read_ply, write_gaussians, write_ply
 from gsmerge.io.cameras.read_cameras import read_cameras
 from gsmerge.io.formats.ply import header_content
 from gsmerge.io.formats.rows import RESULT_COMMENT
@@ -187,3 +187,11 @@ def test_feature_gaussians_are_no_scene(tmp_path: Path) -> None:
     assert read_scene(results).num_gaussians == len(Compactor.load(results))
     with pytest.raises(SceneError, match="Feature Gaussians"):
         read_scene(features)
+
+
+def test_a_page_is_refused_with_what_to_name_instead(tmp_path: Path) -> None:
+    page = tmp_path / "room.html"
+    page.write_text("<!DOCTYPE html>\n<title>room</title>")
+    with refuses(SceneError, page, "name the .ply"):
+        read_gaussians(page)
+    assert "name the .ply" in str(check_content(page))
