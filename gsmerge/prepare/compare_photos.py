@@ -47,6 +47,7 @@ from gsmerge.method.raster import render
 from gsmerge.method.raster.photos import counting_pixels, row_pictures
 from gsmerge.prepare.photo_change import PhotoChange, change_large
 from gsmerge.prepare.row_colors import RowPicture, picture_rows
+from gsmerge.runtime.memory import human_share
 from gsmerge.runtime.record import list_some, note, record_choices
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.settings.stages import Look
@@ -294,11 +295,10 @@ def _describe_hidden(scene: PicturedScene, hidden: np.ndarray, views: Sequence[i
     with_hidden = [view for view in views if hidden[view].any()]
     if not with_hidden:
         return ""
-    max_percent = 100 * max(float(hidden[view].mean()) for view in with_hidden)
-    percent = f"{max_percent:.2g}" if max_percent < 10 else f"{max_percent:.0f}"
+    most = human_share(float(hidden[with_hidden].mean((1, 2)).max()), 0)
     return (
         f"{len(with_hidden)} of {len(views)} photos differ in part from their Gaussians"
-        f" (up to {percent} % of a photo; perhaps a mask, a mark, a finger, another look or camera):"
+        f" (up to {most} of a photo; perhaps a mask, a mark, a finger, another look or camera):"
         f" the Gaussians' colours are used there ({list_some([scene.names[view] for view in with_hidden])};"
         " --set look=scene uses them everywhere)"
     )
