@@ -16,7 +16,7 @@ from typing import TypeVar
 from gsmerge.errors import SceneError
 from gsmerge.io.bounds import walk_files
 from gsmerge.io.first_bytes import CONVERT_ALL, FILM, FOREIGN, IMAGE_SUFFIXES, OTHER_PICTURES
-from gsmerge.types import StrPath
+from gsmerge.types import StrPath, number_views
 
 OTHER_SUFFIXES = frozenset(ending for _, endings, _ in OTHER_PICTURES for ending in endings)  # of formats not read
 FILMS = frozenset(ending for ending, (content, _) in FOREIGN.items() if content == FILM)
@@ -129,9 +129,10 @@ def match_masks(
 ) -> tuple[list[Path | None], list[str]]:
     """Find the mask of every view by the name of its photo, with or without extension; None for a view without a mask.
 
-    Also return a list of notes. A note names masks that belong to no view, or says that no view has a mask. Raise
-    SceneError if a view has two masks, or if no view has a mask and ``named`` is True, which means that the user named
-    the folder; the error names the ``option``.
+    If the user has ``named`` the folder, photos have no names, and there are as many masks, natural order counts. Also
+    return a list of notes. A note says that order counts, names masks that belong to no view, or says that no view has
+    a mask. Raise SceneError if a view has two masks, or if a named folder has no mask of a view; the error names the
+    ``option``.
     """
     files = list_images(folder)
     by_ending = _files_by_ending(folder, files)
@@ -144,6 +145,8 @@ def match_masks(
             neighbour = photo.parent.parent / mask.parent.name
             mask = None if neighbour != photo.parent and neighbour.is_dir() else mask
         masks.append(mask)
+    if named and not any(masks) and tuple(names) == number_views(len(files)):
+        return list(files), [f"{option.removeprefix('--')}: the views have no names: {folder} is taken in order"]
     if not any(masks):
         unread = None if files else _describe_unread_files(walk_files(folder))
         content, remedy = unread or ("none", f"rename the masks, or name another folder with {option}")

@@ -65,6 +65,18 @@ def test_masks_in_a_folder_belong_to_the_photos_in_the_folder_of_its_name(tmp_pa
     assert noted(notes, "masks are not used", tmp_path / "masks", "1.png")
 
 
+def test_masks_of_views_without_names_are_taken_in_order(tmp_path: Path) -> None:
+    for number in (2, 10, 1):
+        cv2.imwrite(str(tmp_path / f"IMG_{number}.png"), np.zeros((2, 2), np.uint8))
+    masks, notes = match_masks(tmp_path, ["view 0", "view 1", "view 2"])
+    assert [mask.name for mask in masks if mask] == ["IMG_1.png", "IMG_2.png", "IMG_10.png"]
+    assert noted(notes, tmp_path, "in order")
+    for others in (["view 0"], ["a", "b", "c"]):
+        with refuses(SceneError, tmp_path, f"{others[0]}.png"):
+            match_masks(tmp_path, others)
+    assert match_masks(tmp_path, ["view 0", "view 1", "view 2"], named=False)[0] == [None] * 3
+
+
 def test_a_folder_of_masks_that_is_named_is_used_or_refused(tiny_folder: Path, tiny: Tiny, tmp_path: Path) -> None:
     """Of twice the size, in another format, of 0 and 1."""
     large = half(tiny).repeat(2, 0).repeat(2, 1).astype(np.uint8)
