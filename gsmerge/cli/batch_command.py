@@ -187,6 +187,7 @@ class Totals:
 
     def add(self, record: Mapping[str, Any]) -> None:
         """Add the record of one scene to the totals."""
+        from gsmerge.io.formats.rows import describe_gain
         from gsmerge.method.facts.pictures import ROW_COLORS
         from gsmerge.method.raster.metrics import MAX_PSNR, psnr_figure
         from gsmerge.runtime.memory import human_share
@@ -222,7 +223,7 @@ class Totals:
             quality = ["the input", "equal" if fidelity["psnr"] >= MAX_PSNR else f"{fidelity['psnr']:.2f}"]
         counts = [f"{report[name]['num_gaussians']:,}" for name in ("output", "input")]
         new = report["new_views"]
-        gain = "" if new is None else f"about {new['after'] - new['before']:+.1f} dB"
+        gain = "" if new is None else describe_gain(new["low"], new["high"])
         share = human_share(report["ratio"])
         seconds = f"{report['total_seconds']:.1f}"
         self.rows.append((record["output"], *counts, share, gain, *quality, seconds))

@@ -10,7 +10,7 @@ from typing import Any
 
 from gsmerge.errors import Doubt, count_words, list_doubts
 from gsmerge.frozen import asdict, dataclass, replace
-from gsmerge.io.formats.rows import ExpectedScores
+from gsmerge.io.formats.rows import ExpectedScores, describe_gain
 from gsmerge.method.raster.metrics import psnr_figure, psnr_words
 from gsmerge.runtime.documents import document_head, note_entries, seconds_document, seconds_line, text_table, wrap_line
 from gsmerge.runtime.memory import human_bytes, human_share
@@ -131,7 +131,7 @@ class CompactReport:
         share = human_share(self.num_output / max(1, self.num_input))
         facts = [f"Gaussians {self.num_input:,} -> {self.num_output:,} ({share})"]
         if new := self.new_views:
-            facts += [f"PSNR of new views, about {new.gain:+.1f} dB from {new.before:.1f} dB"]
+            facts += [f"PSNR of new views, {describe_gain(new.low, new.high)} from {new.before:.1f} dB"]
         if self.psnr_before is not None and self.psnr_after is not None:
             ends = (psnr_figure(psnr, self.choices) for psnr in (self.psnr_before, self.psnr_after))
             facts += [f"PSNR of its own views {' -> '.join(ends)}"]
@@ -246,7 +246,7 @@ def result_table(document: Mapping[str, Any], next_step: str | None = None, *, c
     sizes = [human_bytes(file["bytes"]) for file in files]
     rows = [("Gaussians", counts[0], counts[1], human_share(document["ratio"])), ("file", sizes[0], sizes[1], "")]
     if new := document["new_views"]:
-        gain = f"{new['low']:+.1f} to {new['high']:+.1f} dB, by {new['views']} photos left out"
+        gain = f"{describe_gain(new['low'], new['high'])}, by {new['views']} photos left out"
         rows += [("new views", f"{new['before']:.1f} dB", f"{new['after']:.1f} dB", gain)]
     on_files = document.get("psnr_photo_files")
     if on_files and psnr["after"] is not None and all(f"{on_files[name]:.2f}" == f"{psnr[name]:.2f}" for name in psnr):

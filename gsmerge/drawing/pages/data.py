@@ -11,6 +11,7 @@ from gsmerge.drawing.camera_path import outside_camera
 from gsmerge.drawing.pages.splats import MAX_GAUSSIANS, highest_degree, pack_splats
 from gsmerge.drawing.preview import OUTSIDE_VIEW, BytePicture, lay_on_chequer, to_picture
 from gsmerge.frozen import dataclass, replace
+from gsmerge.io.formats.rows import ExpectedScores
 from gsmerge.io.photo_files import encode_picture, photo_array
 from gsmerge.method.facts.agreement import Agreement
 from gsmerge.method.geometry.frame import Frame, scene_frame
@@ -48,7 +49,7 @@ class Side:
     covered: Quality  # mean over the covered pixels of these views
     seconds: float  # time to draw a view on this machine, with all threads
     antialiased: bool  # how its file says that it is drawn, see :func:`gsmerge.render`
-    new_gain: float | None = None  # expected gain of new views, dB; None if it is not known
+    new_gain: ExpectedScores | None = None  # expected scores of new views; None if they are not known
 
 
 @dataclass(frozen=True)
@@ -120,7 +121,7 @@ def collect_page_data(
     held_out: Views | None = None,
     *,
     cameras: Mapping[str, Cameras] | None = None,
-    new_gains: Mapping[str, float] | None = None,
+    new_gains: Mapping[str, ExpectedScores] | None = None,
     changes: Sequence[str] = (),
     light: bool = False,
     progress: Progress = lambda *_: None,
@@ -129,7 +130,7 @@ def collect_page_data(
 
     ``results`` are Gaussians by name in the scene's world, and may be empty. ``file_bytes`` are the file sizes of the
     scene and of the results. Stills and scores use ``cameras`` (see :func:`gsmerge.evaluate`); 3D uses the scene's
-    cameras. ``new_gains`` says, by result, how many dB better new views are expected to be. For a result that is worse
+    cameras. ``new_gains`` has the scores that new views are expected to have, by result. For a result that is worse
     than the scene, no gain is shown. ``changes`` says what a run did to its input before it merged. If ``light``, the
     scene itself is shown in stills only.
     """

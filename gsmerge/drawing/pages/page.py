@@ -15,6 +15,7 @@ import numpy as np
 
 from gsmerge.drawing.pages.data import PageView, ViewData
 from gsmerge.frozen import dataclass
+from gsmerge.io.formats.rows import describe_gain
 from gsmerge.method.facts.pictures import PHOTOS, ROW_COLORS
 from gsmerge.runtime.memory import human_bytes, human_share
 from gsmerge.types import Cameras
@@ -115,7 +116,7 @@ def headline(data: ViewData, side_id: int = 1) -> str:
     share = after.num_gaussians / max(before.num_gaussians, 1)
     share_text = f"{human_share(share, 1 if share >= 0.01 else 2)} of the Gaussians"
     if after.new_gain is not None and not data.held_out:
-        return f"{share_text}, new views about {describe_gain(after.new_gain)}"
+        return f"{share_text}, new views {describe_gain(after.new_gain.low, after.new_gain.high)}"
     if new is None or old is None or not np.isfinite(new):
         return share_text
     if not np.isfinite(old):  # the input itself is the reference
@@ -123,12 +124,7 @@ def headline(data: ViewData, side_id: int = 1) -> str:
     target = "its own photos" if reference == PHOTOS else reference
     if data.held_out:
         target = "photos that were not used"
-    return f"{share_text}, {describe_gain(new - old)} {'to' if new >= old else 'from'} {target}"
-
-
-def describe_gain(gain: float) -> str:
-    """Return a gain (dB) in words, such as "1.2 dB closer"."""
-    return f"{abs(gain):.1f} dB {'closer' if gain >= 0 else 'farther'}"
+    return f"{share_text}, {abs(new - old):.1f} dB {'closer to' if new >= old else 'farther from'} {target}"
 
 
 def agreement_words(data: ViewData) -> str:
@@ -204,8 +200,8 @@ def list_figures(data: ViewData, side_id: int) -> list[Figure]:
             scores.append(Figure(label, _format_number(old, digits), _format_number(new, digits) + unit, mark))
     if is_expected:
         gain = after.new_gain
-        words = MISSING if gain is None else f"about {gain:+.1f} dB"
-        figures.append(Figure("New views", "", words, "up" if gain is not None and gain > 0 else ""))
+        words = MISSING if gain is None else describe_gain(gain.low, gain.high)
+        figures.append(Figure("New views", "", words, "up" if gain is not None and gain.gain > 0 else ""))
     return figures + (scores if data.scored else [])
 
 

@@ -8,11 +8,11 @@ from pathlib import Path
 
 from gsmerge.drawing.camera_path import median_camera
 from gsmerge.drawing.pages.data import encode_still
-from gsmerge.drawing.pages.page import VIEWER, base64_text, data_uri, describe_gain, page_camera, render_template
+from gsmerge.drawing.pages.page import VIEWER, base64_text, data_uri, page_camera, render_template
 from gsmerge.drawing.preview import to_picture
 from gsmerge.drawing.render_views import near_plane
 from gsmerge.io.atomic import AddOutput
-from gsmerge.io.formats.rows import read_expected_scores
+from gsmerge.io.formats.rows import describe_gain, read_expected_scores
 from gsmerge.io.formats.sog import sog_bytes
 from gsmerge.io.formats.table import Contents
 from gsmerge.method.geometry.transforms import middle_depth
@@ -70,7 +70,7 @@ def make_page(gaussians: Gaussians, cameras: Cameras, title: str, comments: Sequ
         "site.html", policy=SITE_POLICY, title=title, count=len(gaussians), names=NAMES,
         poster=data_uri(poster, "image/webp"), licences=data_uri(licences, "text/plain"),
         inside={NAMES[name]: base64_text(content) for name, content in files.items()},
-        gain=None if expected is None else describe_gain(expected.gain),
+        gain=None if expected is None else describe_gain(expected.low, expected.high),
         download=f"{title}.sog",
         json_data={
             "names": NAMES, "free": is_free, "start": views.index(start),

@@ -18,7 +18,7 @@ from gsmerge.io.atomic import atomic_output
 from gsmerge.io.first_bytes import may_be_replaced
 from gsmerge.io.formats.ply import file_bytes
 from gsmerge.io.formats.read_gaussians import GaussianFile, read_gaussians
-from gsmerge.io.formats.rows import read_expected_scores
+from gsmerge.io.formats.rows import ExpectedScores, read_expected_scores
 from gsmerge.method.viewpoints.place_cameras import add_views
 from gsmerge.reading.input import as_scene
 from gsmerge.reading.scene_files import find_scene_files, scene_title
@@ -112,7 +112,7 @@ def view(
     loaded: dict[str, Any] = {**named, **files}
     gaussians = {name: own_gaussians(result) for name, result in loaded.items()}
     gains = file_gains(files) | {
-        name: expected.gain
+        name: expected
         for name, result in named.items()
         if (expected := getattr(getattr(result, "report", None), "new_views", None)) is not None
     }
@@ -136,10 +136,10 @@ def view(
     return Page(view_page(data).decode(), headline(data))
 
 
-def file_gains(files: Mapping[str, GaussianFile]) -> dict[str, float]:
-    """Return the expected gain of new views, in dB, by the name of each result whose file states them."""
+def file_gains(files: Mapping[str, GaussianFile]) -> dict[str, ExpectedScores]:
+    """Return the expected scores of new views, by the name of each result whose file states them."""
     known = {name: read_expected_scores(file.info.comments) for name, file in files.items()}
-    return {name: scores.gain for name, scores in known.items() if scores}
+    return {name: scores for name, scores in known.items() if scores}
 
 
 def _num_bytes(value: Any) -> int:

@@ -118,6 +118,11 @@ class ExpectedScores:
         return self.after - self.before
 
 
+def describe_gain(low: float, high: float) -> str:
+    """Describe the bounds of the expected gain of new views (dB), as every table and page does."""
+    return f"{low:+.1f} to {high:+.1f} dB"
+
+
 def result_comments(scores: ExpectedScores | None, kept: Sequence[str] = ()) -> list[str]:
     """Return the header comments of a result: its mark, comments ``kept`` from the input, and the expected scores."""
     return [RESULT_COMMENT, *kept, *([] if scores is None else [new_views_comment(scores)])]

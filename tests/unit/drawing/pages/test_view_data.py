@@ -22,6 +22,7 @@ from gsmerge.drawing.pages.data import ViewData, collect_page_data, encode_still
 from gsmerge.drawing.pages.page import headline
 from gsmerge.drawing.pages.splats import pack_splats
 from gsmerge.drawing.preview import to_picture
+from gsmerge.io.formats.rows import ExpectedScores
 from gsmerge.io.formats.spz import UNIX, spz_bytes
 from gsmerge.method.facts.pictures import ROW_COLORS
 from gsmerge.method.geometry.frame import scene_frame
@@ -69,9 +70,10 @@ def actual() -> ViewData:
 
 def test_a_result_that_is_worse_has_no_expected_gain(small: Scene) -> None:
     """It may be of another scene; held-out photos say it themselves."""
+    gain = ExpectedScores(20.0, 27.8, 6.0, 9.0)
     results = {"other": small.gaussians[:10], "same": small.gaussians}
-    made = collect_page_data("room", small, results, (300, 10, 300), new_gains=dict.fromkeys(results, 7.8))
-    assert [side.new_gain for side in made.sides] == [None, None, 7.8]
+    made = collect_page_data("room", small, results, (300, 10, 300), new_gains=dict.fromkeys(results, gain))
+    assert [side.new_gain for side in made.sides] == [None, None, gain]
     assert noted(made.notes, "other", "worse than room")
     assert "expected" not in headline(made)
 

@@ -16,6 +16,7 @@ from page_policy import check_policy
 
 from gsmerge.drawing.pages.data import ViewData, collect_page_data
 from gsmerge.drawing.pages.page import headline, results_table, speed, speed_words, view_page
+from gsmerge.io.formats.rows import ExpectedScores
 from gsmerge.scoring.evaluate import Quality
 
 EVIL = '</script><b onload="x">&{{ 7 * 7 }}'
@@ -131,13 +132,13 @@ def test_each_result_has_its_headline_and_figures(data: ViewData) -> None:
 
 def test_gain_of_new_views_comes_before_scores_of_own_photos(data: ViewData) -> None:
     three = with_three_results(data)
-    gains = (None, 3.2, -0.2, None)
+    gains = (None, ExpectedScores(20, 23.2, 1.5, 4.5), ExpectedScores(20, 19.8, -1.2, 0.8), None)
     sides = tuple(replace(side, new_gain=gain) for side, gain in zip(three.sides, gains, strict=True))
     page = page_of(replace(three, sides=sides))
     half, tenth, least = json.loads(block(page, "data"))["results"]
-    assert "new views about 3.2 dB closer" in half["headline"].replace("\u00a0", " ")
-    assert half["figures"][2:] == [["about +3.2 dB", "up"], ["25.00 dB", "own"]]
-    assert tenth["figures"][2] == ["about -0.2 dB", ""]
+    assert "new views +1.5 to +4.5 dB" in half["headline"].replace("\u00a0", " ")
+    assert half["figures"][2:] == [["+1.5 to +4.5 dB", "up"], ["25.00 dB", "own"]]
+    assert tenth["figures"][2] == ["-1.2 to +0.8 dB", ""]
     assert least["figures"][2] == ["-", ""]
     assert "No photo was held out: scores are those of photos that fits have seen." in page
 
