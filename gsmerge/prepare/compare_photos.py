@@ -56,7 +56,7 @@ from gsmerge.types import PicturedScene
 # Signed differences of pixels are averaged over MEAN_PIXELS x MEAN_PIXELS pixels of the photos that a model saw. If it
 # blurs a photo by 1.5 pixels, only 0.5 % of the averages differ by EXPOSURE_STEP
 MEAN_PIXELS = 5
-LEAST_JUDGED = 0.25  # share of a photo's pixels that count from which it is judged as a whole
+LEAST_JUDGED = 0.25  # share of a photo's, or of a window's, pixels that count from which it is judged as a whole
 TONE_SAMPLE = 1 << 16  # approximate number of pixels and of Gaussians whose colours are compared
 COMPARED_OPACITY = 0.05  # opacity below which a pixel's Gaussian is not compared
 GREY_VARIATION = 0.25  # a photo is grey if its hues vary by less than this share of the Gaussians' variation
@@ -326,13 +326,15 @@ def _find_hidden(scene: PicturedScene, changes: Sequence[PhotoChange]) -> tuple[
     def differ(view: int, picture: np.ndarray, known: np.ndarray) -> np.ndarray:
         """Return a mask of the pixels at which a view's photo differs from ``picture``, in its ``known`` part."""
         weights = known.astype(np.float32)
+        around = convolve(weights, window, window)
         photo = changes[view](scene.images[view])
         if spacing > 1:
             photo = convolve(photo, footprint, footprint)
         difference = (photo - picture) * weights[..., None]
         red, green, blue = np.moveaxis(np.abs(convolve(difference, window, window)), -1, 0)
-        differs = known & ((red + green + blue) / 3 > EXPOSURE_STEP * convolve(weights, window, window))
-        return fill_gaps(differs[..., None], known)[..., 0]
+        differs = known & ((red + green + blue) / 3 > EXPOSURE_STEP * around)
+        # what is left of a view that has lost its rows is too little to judge the pixels around it
+        return fill_gaps(differs[..., None], known & (around > LEAST_JUDGED / spacing**2))[..., 0]
 
     def compare_drawn(views: np.ndarray, drawn: RowPicture) -> None:
         """Compare the photos of ``views`` with a drawing, and update ``hidden`` and ``pictures`` of these views."""

@@ -84,6 +84,19 @@ def test_photos_that_differ_are_told_with_their_share(side: int, room: Scene) ->
     assert "1 of 4 photos differ in part" in change
 
 
+def test_a_stray_row_does_not_judge_the_pixels_that_have_lost_theirs(room: Scene) -> None:
+    """Of the second view, a strip is left, and one row far from it that shows something else."""
+    kept = np.ones(room.images.shape[:3], bool)
+    kept[1, 12:] = False
+    kept[1, 50, 40] = True
+    sh0 = room.gaussians.sh0.copy()
+    sh0[room.pixels.fronts[1, 50, 40]] *= -1
+    scene = scenes.shown_in(replace(room, gaussians=replace(room.gaussians, sh0=sh0)), kept)
+    compared, views, _ = compare_photos(PicturedScene.with_pictures(scene, room.images, None))
+    assert views == (0, 1, 2, 3)
+    assert (compared.images[1] != room.images[1]).any(-1).sum() <= 1
+
+
 @sweep(
     "look",
     [grey, false_colors, styled, lambda colors: colors[..., ::-1]],
