@@ -33,6 +33,7 @@ TASKS: dict[str, tuple[tuple[str, ...], ...]] = {  # the calls of each task
     "native": (("python", "gsmerge/method/kernels/build.py"),),
     "tests": (("python", "-m", "pytest"),),
     "sweeps": (("python", "-m", "pytest", "-m", "slow"),),
+    "release-tests": (("python", "-m", "pytest", "-m", "release"),),
     "processors": (("python", "tools/processors.py"),),
     "lint": (("ruff", "check", "."), ("ruff", "format", "--check", ".")),
     "types": (("mypy", "-p", "gsmerge"),),

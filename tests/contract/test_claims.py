@@ -259,8 +259,18 @@ def example(tmp_path_factory: pytest.TempPathFactory) -> tuple[gsmerge.Scene, gs
     return load.scene, gsmerge.Views(held_out.cameras, held_out.images, held_out.names)
 
 
-@pytest.mark.slow  # a run for each row, half a minute together
-@pytest.mark.parametrize(("page", "row"), [(page, row) for page, rows in TABLES.items() for row in rows])
+# A run for each row. The sweeps try what users are told first; runs of 5 to 20 seconds are tried before a release
+SWEPT = {(COMPACT, row) for row in ("defaults", "`--effort draft`", "`--effort fast`", "`--fit none`")}
+
+
+@pytest.mark.parametrize(
+    ("page", "row"),
+    [
+        pytest.param(page, row, marks=pytest.mark.slow if (page, row) in SWEPT else pytest.mark.release)
+        for page, rows in TABLES.items()
+        for row in rows
+    ],
+)
 def test_tables_of_the_example_are_those_of_today(
     page: str, row: str, example: tuple[gsmerge.Scene, gsmerge.Views]
 ) -> None:
