@@ -10,13 +10,12 @@ from pathlib import Path
 import pytest
 from messages import refuses
 from scripts import load_script
-from sweeps import sweep
 
 from gsmerge.method.kernels import build as module
 from gsmerge.method.kernels.build import Platform, build_libraries, compiler, find_platform, hash_sources
 
 HEADS = {"linux": b"\x7fELF", "macosx": b"\xcf\xfa\xed\xfe", "win": b"MZ"}
-PLATFORMS = (  # the first has one target alone, which takes the least time
+PLATFORMS = (
     "win_arm64", "manylinux_2_17_x86_64", "manylinux_2_17_aarch64", "macosx_11_0_arm64", "macosx_10_13_x86_64",
     "win_amd64",
 )  # fmt: skip
@@ -36,12 +35,23 @@ def test_the_installation_has_built_the_libraries_of_this_platform() -> None:
     check_libraries([module.FOLDER / where.library_name(target) for target in where.targets], where)
 
 
-@sweep("tag", [tag for tag in PLATFORMS if find_platform(tag) != find_platform()], often=0)
+# In the sweeps each system and family of processors once; the others, of the same, before a release
+SWEPT = ("macosx_11_0_arm64", "win_amd64")
+
+
+@pytest.mark.parametrize(
+    "tag",
+    [
+        pytest.param(tag, marks=pytest.mark.slow if tag in SWEPT else pytest.mark.release)
+        for tag in PLATFORMS
+        if find_platform(tag) != find_platform()
+    ],
+)
 def test_libraries_of_every_other_platform_are_built_here(tag: str, tmp_path: Path) -> None:
     paths = build_libraries(tmp_path, platform=tag)
     check_libraries(paths, find_platform(tag))
     assert sorted(tmp_path.iterdir()) == sorted(paths)
-    if tag == "manylinux_2_17_aarch64":  # of one target, which takes the least time
+    if tag == "macosx_11_0_arm64":  # of one target, which takes the least time
         assert [path.read_bytes() for path in build_libraries(tmp_path / "again", platform=tag)] == [
             paths[0].read_bytes()
         ]
