@@ -59,6 +59,7 @@ def packed(source: Path) -> set[str]:
     return {str(path.relative_to(source)) for path in files}
 
 
+@pytest.mark.slow
 def test_the_wheel_holds_every_file_of_the_package(built: Path) -> None:
     """The build is one of setuptools, in a process of its own."""
     (wheel,) = (built / "dist").glob("*.whl")

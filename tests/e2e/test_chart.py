@@ -86,6 +86,7 @@ def test_grid_writes_records_table_page_and_charts(tmp_path: Path) -> None:
     assert {path.name for path in (out / "charts").iterdir()} == drawn
 
 
+@pytest.mark.slow
 def test_a_grid_that_was_killed_goes_on_where_it_was(copied: Path, merges: list[object], run: Run) -> None:
     path = copied / "out" / "runs.jsonl"
     before = path.read_bytes()

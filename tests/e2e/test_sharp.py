@@ -64,6 +64,7 @@ def test_several_files_become_one_scene(run: Run, sharp: Path, tmp_path: Path) -
     np.testing.assert_allclose(written, both.cameras.viewmats, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_dry_run_counts_all_files(run: Run, sharp: Path) -> None:
     files = [sharp / "out" / f"{name}.ply" for name in NAMES]
     plan = json.loads(run("compact", *files, "--images", sharp / "photos", "--dry-run", "--json", code=0).out)

@@ -101,6 +101,7 @@ def test_wrong_settings_are_refused_in_one_line(
     assert_refused(said, 2, place, value)
 
 
+@pytest.mark.slow
 def test_data_may_be_a_folder_of_scenes(small_copy: Path, tmp_path: Path, run: Run) -> None:
     """Training prepares three scenes, and begins with loading torch."""
     folder, out = tmp_path / "scenes", tmp_path / "scenes" / "run"
