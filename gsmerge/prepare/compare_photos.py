@@ -75,8 +75,12 @@ def compare_photos(scene: PicturedScene, look: Look = "auto") -> tuple[PicturedS
     if look != "auto" or not photo_views:
         return scene, tuple(photo_views) if look != "scene" else (), []
     pairs = pair_photos(scene, scene.images)
-    # what is left of a photo of which most does not count, as of a blurred one, is too little to judge it
+    # what is left of a photo of which most does not count, as of a blurred one, is too little to judge it, and so is a
+    # view that has lost most of the rows that views usually have
     shares = counting_pixels(scene).mean((1, 2))
+    if scene.has_own_pixels:
+        rows = scene.get_pixels().shown.mean((1, 2))
+        shares = np.minimum(shares, rows / max(np.median(rows), 1e-9))
     judged = [view for view in photo_views if shares[view] >= LEAST_JUDGED] or photo_views
     grey = find_grey(pairs, judged)
     if grey:
@@ -325,6 +329,9 @@ def _find_hidden(scene: PicturedScene, changes: Sequence[PhotoChange]) -> tuple[
 
     def differ(view: int, picture: np.ndarray, known: np.ndarray) -> np.ndarray:
         """Return a mask of the pixels at which a view's photo differs from ``picture``, in its ``known`` part."""
+        around = convolve(known.astype(np.float32), window, window)
+        # what is left of a view that has lost its rows is too little to judge the pixels around it
+        known = known & (around > LEAST_JUDGED / spacing**2)
         weights = known.astype(np.float32)
         around = convolve(weights, window, window)
         photo = changes[view](scene.images[view])
@@ -333,8 +340,7 @@ def _find_hidden(scene: PicturedScene, changes: Sequence[PhotoChange]) -> tuple[
         difference = (photo - picture) * weights[..., None]
         red, green, blue = np.moveaxis(np.abs(convolve(difference, window, window)), -1, 0)
         differs = known & ((red + green + blue) / 3 > EXPOSURE_STEP * around)
-        # what is left of a view that has lost its rows is too little to judge the pixels around it
-        return fill_gaps(differs[..., None], known & (around > LEAST_JUDGED / spacing**2))[..., 0]
+        return fill_gaps(differs[..., None], known)[..., 0]
 
     def compare_drawn(views: np.ndarray, drawn: RowPicture) -> None:
         """Compare the photos of ``views`` with a drawing, and update ``hidden`` and ``pictures`` of these views."""

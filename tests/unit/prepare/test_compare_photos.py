@@ -97,6 +97,21 @@ def test_a_stray_row_does_not_judge_the_pixels_that_have_lost_theirs(room: Scene
     assert (compared.images[1] != room.images[1]).any(-1).sum() <= 1
 
 
+def test_a_photo_is_not_left_out_by_a_view_that_has_lost_its_rows(room: Scene) -> None:
+    """The few that are left in the third view belong to another one, and show something else."""
+    kept = np.ones(room.images.shape[:3], bool)
+    kept[2] = False
+    kept[2, 40, 30:40] = True
+    sh0 = room.gaussians.sh0.copy()
+    sh0[room.pixels.fronts[2, 40, 30:40]] = np.random.default_rng(0).normal(size=(10, 1, 3))
+    scene = scenes.shown_in(replace(room, gaussians=replace(room.gaussians, sh0=sh0)), kept)
+    with record_run() as record:
+        compared, views, _ = compare_photos(PicturedScene.with_pictures(scene, room.images, None))
+    assert views == (0, 1, 2, 3)
+    assert "photos_left_out" not in record.choices
+    np.testing.assert_array_equal(compared.images[2], room.images[2])
+
+
 @sweep(
     "look",
     [grey, false_colors, styled, lambda colors: colors[..., ::-1]],
