@@ -262,9 +262,11 @@ def fill_scene(p: Prepared, options: PrepareOptions) -> Prepared:
     count = len(scene.gaussians) - len(p.scene.gaussians)
     added = f"{count_words(count, 'Gaussian')} added at pixels that no Gaussian covered enough" if count else ""
     rows = p.scene.get_pixels().shown
-    few = [name for name, share in zip(scene.names, rows.mean((1, 2)), strict=True) if share < MOST_EMPTY]
+    shares = rows.mean((1, 2))
+    usual = float(np.median(shares))
+    few = [name for name, share in zip(scene.names, shares, strict=True) if share < MOST_EMPTY * usual]
     if count and few:
-        added += f"; fewer than half of the pixels of {list_some(few)} had one"
+        added += f"; {list_some(few)} had fewer than half as many Gaussians as views usually have"
     elif count and not rows[:, [0, -1]].any():
         added += ", which is usual: the model left the borders of its pictures out, and perhaps the sky"
     drawn = ""
