@@ -145,18 +145,22 @@ def match_masks(
             neighbour = photo.parent.parent / mask.parent.name
             mask = None if neighbour != photo.parent and neighbour.is_dir() else mask
         masks.append(mask)
-    if named and not any(masks) and tuple(names) == number_views(len(files)):
+    have_no_names = tuple(names) == number_views(len(names))
+    if named and not any(masks) and have_no_names and len(files) == len(names):
         return list(files), [f"{option.removeprefix('--')}: the views have no names: {folder} is taken in order"]
     if not any(masks):
         unread = None if files else _describe_unread_files(walk_files(folder))
-        content, remedy = unread or ("none", f"rename the masks, or name another folder with {option}")
-        problem = f"expected masks with the names of the photos, such as {PurePath(names[0]).stem}.png, found {content}"
+        remedy = f"rename the masks, or name another folder with {option}"
+        content, remedy = unread or (f"none among {len(files)} pictures", remedy)
+        order = f", or one for each of the {len(names)} views" if have_no_names else ""
+        expected = f"expected masks with the names of the photos, such as {PurePath(names[0]).stem}.png{order}"
+        problem = f"{expected}, found {content}"
         if named:
             raise SceneError(folder, problem, remedy)
         return masks, [f"masks are not used: {folder}: {problem}; {remedy}"]
     unused = [file.relative_to(folder).as_posix() for file in files if file not in masks]
     examples = ", ".join(unused[:3]) + ", ..." * (len(unused) > 3)
-    note = f"{option.removeprefix('--')}: {len(unused)} pictures in {folder} have the name of no photo: {examples}"
+    note = f"{option.removeprefix('--')}: pictures in {folder} with the name of no photo: {examples} ({len(unused)})"
     return masks, [note] if unused else []
 
 

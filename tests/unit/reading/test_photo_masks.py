@@ -74,6 +74,8 @@ def test_masks_of_views_without_names_are_taken_in_order(tmp_path: Path) -> None
     for others in (["view 0"], ["a", "b", "c"]):
         with refuses(SceneError, tmp_path, f"{others[0]}.png"):
             match_masks(tmp_path, others)
+    with refuses(SceneError, tmp_path, "each of the 4 views", "3 pictures"):
+        match_masks(tmp_path, [f"view {view}" for view in range(4)])
     assert match_masks(tmp_path, ["view 0", "view 1", "view 2"], named=False)[0] == [None] * 3
 
 
