@@ -94,7 +94,7 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = Fa
             holes[view] &= cv2.morphologyEx(covered.astype(np.uint8), cv2.MORPH_CLOSE, window) > 0
         if covered.any() and holes[view].any():
             beside = fill_gaps(depths[..., None], covered)[..., 0]
-            pixels, own_depths = _sample_fronts(scene, view)
+            pixels, own_depths = _sample_depths(scene, view, depths, covered)
             known = _fit_map(scene, view, pixels, own_depths)
             surfaces = own_depths if view in parts and own_depths.size else depths[covered]
             (farthest,) = quantiles(surfaces, [FARTHEST_QUANTILE])
@@ -168,11 +168,21 @@ class _Edges:
     known: np.ndarray | None = None  # [n] depth of each hole in the view's depth map, NaN without one
 
 
-def _sample_fronts(scene: PicturedScene, view: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return pixels ``[p]`` of a view that have a Gaussian, at most about SAMPLE, and the depths ``[p]`` of these."""
+def _sample_depths(
+    scene: PicturedScene, view: int, depths: np.ndarray, covered: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return pixels ``[p]`` of a view that have a Gaussian, at most about SAMPLE, and the depths ``[p]`` of these.
+
+    If the view has lost its rows, so that its drawing, ``depths [h,w]``, has more than twice as many pixels that are
+    ``covered [h,w]``, the depths of the drawing are returned, which other views know.
+    """
     fronts = scene.get_pixels().fronts[view].reshape(-1)
-    pixels = np.flatnonzero(fronts >= 0)
+    own = np.flatnonzero(fronts >= 0)
+    is_lost = 2 * len(own) < np.count_nonzero(covered)
+    pixels = np.flatnonzero(covered) if is_lost else own
     pixels = pixels[:: 1 + len(pixels) // SAMPLE]
+    if is_lost:
+        return pixels, depths.reshape(-1)[pixels].astype(np.float64)
     means = scene.gaussians.means[fronts[pixels]].astype(np.float64)
     return pixels, camera_depths(means, scene.cameras.viewmats[view])
 

@@ -250,6 +250,22 @@ def test_a_depth_map_counts_where_few_gaussians_tell_its_unit() -> None:
     assert np.median(np.abs(np.log(1.7 * depths_of(filled)[1][new] / maps[1][new]))) < 0.01
 
 
+@pytest.mark.parametrize("is_right", [True, False])
+def test_other_views_confirm_the_map_of_a_view_that_has_lost_its_rows(tmp_path: Path, *, is_right: bool) -> None:
+    """Of its own rows one is left, which confirms nothing."""
+    tiny = smooth_scene(96, 72)
+    scene = load_scene(save_export(tmp_path, tiny, export_rows(tiny))).scene
+    kept = scene.pixels.shown.copy()
+    kept[1] = False
+    kept[1, 50, 40] = True
+    maps = tiny.depths.copy()
+    maps[1] = maps[1] if is_right else np.random.default_rng(0).permuted(maps[1])
+    few = PicturedScene.with_pictures(scenes.shown_in(scene, kept), scene.images, None)
+    with record_run() as record:
+        filled_everywhere(replace(few, depths=3 * maps))
+    assert noted(record.notes, "depth maps", "1 of 3 views", scene.names[1]) != is_right
+
+
 LOST: dict[str, tuple[Callable[[np.ndarray], None], float]] = {  # changes of rows [v,h,w], and dB that they may cost
     "some placeholders": (lambda rows: rows.reshape(-1)[::97].fill(0), 0.3),
     "a strip times a mask": (lambda rows: rows[:, :, :12].fill(0), 0.3),
