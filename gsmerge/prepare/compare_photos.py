@@ -44,7 +44,7 @@ from gsmerge.method.geometry.transforms import sh0_to_rgb
 from gsmerge.method.geometry.views import camera_kinds
 from gsmerge.method.kernels.pictures import convolve
 from gsmerge.method.raster import render
-from gsmerge.method.raster.photos import counting_pixels, row_pictures
+from gsmerge.method.raster.photos import counting_pixels, row_pictures, row_shares
 from gsmerge.prepare.photo_change import PhotoChange, change_large
 from gsmerge.prepare.row_colors import RowPicture, picture_rows
 from gsmerge.runtime.memory import human_share
@@ -79,8 +79,7 @@ def compare_photos(scene: PicturedScene, look: Look = "auto") -> tuple[PicturedS
     # view that has lost most of the rows that views usually have
     shares = counting_pixels(scene).mean((1, 2))
     if scene.has_own_pixels:
-        rows = scene.get_pixels().shown.mean((1, 2))
-        shares = np.minimum(shares, rows / max(np.median(rows), 1e-9))
+        shares = np.minimum(shares, row_shares(scene))
     judged = [view for view in photo_views if shares[view] >= LEAST_JUDGED] or photo_views
     grey = find_grey(pairs, judged)
     if grey:

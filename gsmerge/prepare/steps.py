@@ -16,7 +16,7 @@ from gsmerge.frozen import dataclass, replace
 from gsmerge.method.facts.pictures import PHOTOS, RENDERS, ROW_COLORS
 from gsmerge.method.facts.prepared import Prepared, Reference, with_photos
 from gsmerge.method.geometry.frame import Frame, canonicalise
-from gsmerge.method.raster.photos import counting_pixels
+from gsmerge.method.raster.photos import counting_pixels, row_shares
 from gsmerge.method.viewpoints.place_cameras import HELD_OUT, describe_dropped, draw_pictures, keep_finite, place_views
 from gsmerge.prepare.blurred import leave_out_blurred
 from gsmerge.prepare.compare_photos import compare_photos
@@ -261,13 +261,10 @@ def fill_scene(p: Prepared, options: PrepareOptions) -> Prepared:
     scene = draw_left_out(replace(filled, depths=None), masks)
     count = len(scene.gaussians) - len(p.scene.gaussians)
     added = f"{count_words(count, 'Gaussian')} added at pixels that no Gaussian covered enough" if count else ""
-    rows = p.scene.get_pixels().shown
-    shares = rows.mean((1, 2))
-    usual = float(np.median(shares))
-    few = [name for name, share in zip(scene.names, shares, strict=True) if share < MOST_EMPTY * usual]
+    few = [name for name, share in zip(scene.names, row_shares(p.scene), strict=True) if share < MOST_EMPTY]
     if count and few:
         added += f"; {list_some(few)} had fewer than half as many Gaussians as views usually have"
-    elif count and not rows[:, [0, -1]].any():
+    elif count and not p.scene.get_pixels().shown[:, [0, -1]].any():
         added += ", which is usual: the model left the borders of its pictures out, and perhaps the sky"
     drawn = ""
     if scene.images is not p.scene.images:

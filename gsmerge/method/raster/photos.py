@@ -189,6 +189,12 @@ def counting_pixels(scene: Scene) -> np.ndarray:
     return np.full(shape, True) if scene.masks is None else scene.masks
 
 
+def row_shares(scene: Scene) -> np.ndarray:
+    """Return how many pixels of each view ``[v]`` have a Gaussian, relative to how many views usually have."""
+    shares = scene.get_pixels().shown.mean((1, 2))
+    return np.asarray(shares / max(float(np.median(shares)), 1e-9))
+
+
 def pixel_weights(masks: np.ndarray | None, width: int, height: int) -> np.ndarray | None:
     """Convert masks ``[v,h,w]`` to pixel weights ``[v,height,width]``: 1 inside, ``MASKED_WEIGHT`` outside.
 
