@@ -52,7 +52,7 @@ def show_page(
     """
     from gsmerge.drawing.pages.data import collect_page_data
     from gsmerge.drawing.pages.page import headline, speed, speed_words, view_page
-    from gsmerge.drawing.pages.view import check_page_name, file_gains
+    from gsmerge.drawing.pages.view import check_page_name, file_new_views
     from gsmerge.io.atomic import common_mode
     from gsmerge.runtime.documents import document_head, note_entries
 
@@ -70,7 +70,7 @@ def show_page(
         sizes = [pair.load.info.file_bytes, *(ply.info.file_bytes for ply in pair.plys.values())]
         data = collect_page_data(
             pair.title, pair.scene, pair.gaussians, sizes, pair.held_out, cameras=pair.cameras,
-            new_gains=file_gains(pair.plys), changes=changes, light=light, progress=progress,
+            new_views=file_new_views(pair.plys), changes=changes, light=light, progress=progress,
         )  # fmt: skip
     page = view_page(data)
     write_texts({output: page}, mode)

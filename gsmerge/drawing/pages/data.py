@@ -49,7 +49,7 @@ class Side:
     covered: Quality  # mean over the covered pixels of these views
     seconds: float  # time to draw a view on this machine, with all threads
     antialiased: bool  # how its file says that it is drawn, see :func:`gsmerge.render`
-    new_gain: ExpectedScores | None = None  # expected scores of new views; None if they are not known
+    new_views: ExpectedScores | None = None  # expected scores of new views; None if they are not known
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,7 @@ def collect_page_data(
     held_out: Views | None = None,
     *,
     cameras: Mapping[str, Cameras] | None = None,
-    new_gains: Mapping[str, ExpectedScores] | None = None,
+    new_views: Mapping[str, ExpectedScores] | None = None,
     changes: Sequence[str] = (),
     light: bool = False,
     progress: Progress = lambda *_: None,
@@ -130,7 +130,7 @@ def collect_page_data(
 
     ``results`` are Gaussians by name in the scene's world, and may be empty. ``file_bytes`` are the file sizes of the
     scene and of the results. Stills and scores use ``cameras`` (see :func:`gsmerge.evaluate`); 3D uses the scene's
-    cameras. ``new_gains`` has the scores that new views are expected to have, by result. For a result that is worse
+    cameras. ``new_views`` has the scores that new views are expected to have, by result. For a result that is worse
     than the scene, no gain is shown. ``changes`` says what a run did to its input before it merged. If ``light``, the
     scene itself is shown in stills only.
     """
@@ -162,18 +162,17 @@ def collect_page_data(
             stills=stills, light=light, cut_out=bool(cut_out),
         )  # fmt: skip
     progress("done", 0, 0)
-    gains = new_gains or {}
     sides = []
     notes = list[str]()
     for side in data.sides:
-        gain = gains.get(side.name)
-        if gain is not None and not data.held_out and is_worse(data.sides[0].mean.psnr, side.mean.psnr):
-            gain = None
+        expected = (new_views or {}).get(side.name)
+        if expected is not None and not data.held_out and is_worse(data.sides[0].mean.psnr, side.mean.psnr):
+            expected = None
             notes.append(
                 f"{side.name} shows these photos worse than {data.title} does, so its expected gain of new views is"
                 " left out; is it a result of this scene?"
             )
-        sides.append(replace(side, new_gain=gain))
+        sides.append(replace(side, new_views=expected))
     return replace(data, sides=tuple(sides), notes=(*data.notes, *notes), changes=tuple(changes))
 
 

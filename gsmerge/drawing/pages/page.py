@@ -115,8 +115,8 @@ def headline(data: ViewData, side_id: int = 1) -> str:
     new = after.mean.psnr
     share = after.num_gaussians / max(before.num_gaussians, 1)
     share_text = f"{human_share(share, 1 if share >= 0.01 else 2)} of the Gaussians"
-    if after.new_gain is not None and not data.held_out:
-        return f"{share_text}, new views {describe_gain(after.new_gain.low, after.new_gain.high)}"
+    if after.new_views is not None and not data.held_out:
+        return f"{share_text}, new views {describe_gain(after.new_views.low, after.new_views.high)}"
     if new is None or old is None or not np.isfinite(new):
         return share_text
     if not np.isfinite(old):  # the input itself is the reference
@@ -181,7 +181,7 @@ def list_figures(data: ViewData, side_id: int) -> list[Figure]:
         Figure("File", human_bytes(before.file_bytes), human_bytes(after.file_bytes), ""),
     ]
     views, own = reference_words(data)
-    is_expected = not data.held_out and any(side.new_gain is not None for side in data.sides)
+    is_expected = not data.held_out and any(side.new_views is not None for side in data.sides)
     names = ("psnr",) if is_expected else ("psnr", "ssim")  # the expected gain takes the room of the SSIM
     qualities = [(f"{name.upper()}, {views}", name, before.mean, after.mean) for name in names]
     if data.lacks_pixels:
@@ -199,9 +199,9 @@ def list_figures(data: ViewData, side_id: int) -> list[Figure]:
                 mark = "own"
             scores.append(Figure(label, _format_number(old, digits), _format_number(new, digits) + unit, mark))
     if is_expected:
-        gain = after.new_gain
-        words = MISSING if gain is None else describe_gain(gain.low, gain.high)
-        figures.append(Figure("New views", "", words, "up" if gain is not None and gain.gain > 0 else ""))
+        expected = after.new_views
+        words = MISSING if expected is None else describe_gain(expected.low, expected.high)
+        figures.append(Figure("New views", "", words, "up" if expected is not None and expected.gain > 0 else ""))
     return figures + (scores if data.scored else [])
 
 

@@ -111,7 +111,7 @@ def view(
     files = {name: read_gaussians(path) for name, path in named.items() if isinstance(path, str | PathLike)}
     loaded: dict[str, Any] = {**named, **files}
     gaussians = {name: own_gaussians(result) for name, result in loaded.items()}
-    gains = file_gains(files) | {
+    new_views = file_new_views(files) | {
         name: expected
         for name, result in named.items()
         if (expected := getattr(getattr(result, "report", None), "new_views", None)) is not None
@@ -131,12 +131,12 @@ def view(
     data = collect_page_data(
         scene_title(Path(scene)) if isinstance(scene, str | PathLike) else "scene", shown_scene, gaussians,
         [_num_bytes(scene), *(_num_bytes(result) for result in loaded.values())], held_out,
-        cameras=cameras, new_gains=gains, changes=changes, light=is_light, progress=progress or (lambda *_: None),
+        cameras=cameras, new_views=new_views, changes=changes, light=is_light, progress=progress or (lambda *_: None),
     )  # fmt: skip
     return Page(view_page(data).decode(), headline(data))
 
 
-def file_gains(files: Mapping[str, GaussianFile]) -> dict[str, ExpectedScores]:
+def file_new_views(files: Mapping[str, GaussianFile]) -> dict[str, ExpectedScores]:
     """Return the expected scores of new views, by the name of each result whose file states them."""
     known = {name: read_expected_scores(file.info.comments) for name, file in files.items()}
     return {name: scores for name, scores in known.items() if scores}

@@ -72,8 +72,8 @@ def test_a_result_that_is_worse_has_no_expected_gain(small: Scene) -> None:
     """It may be of another scene; held-out photos say it themselves."""
     gain = ExpectedScores(20.0, 27.8, 6.0, 9.0)
     results = {"other": small.gaussians[:10], "same": small.gaussians}
-    made = collect_page_data("room", small, results, (300, 10, 300), new_gains=dict.fromkeys(results, gain))
-    assert [side.new_gain for side in made.sides] == [None, None, gain]
+    made = collect_page_data("room", small, results, (300, 10, 300), new_views=dict.fromkeys(results, gain))
+    assert [side.new_views for side in made.sides] == [None, None, gain]
     assert noted(made.notes, "other", "worse than room")
     assert "expected" not in headline(made)
 

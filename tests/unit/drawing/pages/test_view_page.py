@@ -133,7 +133,7 @@ def test_each_result_has_its_headline_and_figures(data: ViewData) -> None:
 def test_gain_of_new_views_comes_before_scores_of_own_photos(data: ViewData) -> None:
     three = with_three_results(data)
     gains = (None, ExpectedScores(20, 23.2, 1.5, 4.5), ExpectedScores(20, 19.8, -1.2, 0.8), None)
-    sides = tuple(replace(side, new_gain=gain) for side, gain in zip(three.sides, gains, strict=True))
+    sides = tuple(replace(side, new_views=gain) for side, gain in zip(three.sides, gains, strict=True))
     page = page_of(replace(three, sides=sides))
     half, tenth, least = json.loads(block(page, "data"))["results"]
     assert "new views +1.5 to +4.5 dB" in half["headline"].replace("\u00a0", " ")
