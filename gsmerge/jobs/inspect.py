@@ -14,7 +14,7 @@ from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.formats.gsm import list_batches
 from gsmerge.io.formats.ply import is_from_gsmerge
 from gsmerge.io.formats.read_gaussians import degree_notes
-from gsmerge.io.formats.rows import RESULT_COMMENT, read_expected_scores
+from gsmerge.io.formats.rows import RESULT_COMMENT, describe_gain, read_expected_scores
 from gsmerge.io.photo_files import photo_array
 from gsmerge.jobs.estimate import estimate, estimate_lines
 from gsmerge.method.facts.scene_size import unlike_captures
@@ -264,7 +264,7 @@ def inspection_lines(scene: Mapping[str, Any]) -> list[str]:
         shares = (f"{100 * agreement[key]:.0f} %" for key in ("confirmed", "contradicted", "alone"))
         lines += ["depth      other views confirm {} of the pixels, contradict {}, do not see {}".format(*shares)]
     if new := scene["new_views"]:
-        gain = f"about {new['after'] - new['before']:+.1f} dB against its input"
+        gain = f"{describe_gain(new['low'], new['high'])} against its input"
         lines += [f"new views  {gain}, which shows them at {new['before']:.1f} dB"]
     run = scene["compact"]
     if scene["is_result"]:
