@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
+from gsmerge.arrays import mean_columns
 from gsmerge.frozen import replace
 from gsmerge.method.geometry.transforms import camera_distances, median, order_others
 from gsmerge.method.geometry.views import take_rows
@@ -96,14 +97,14 @@ def leave_out_blurred(scene: PicturedScene) -> tuple[PicturedScene, np.ndarray |
 
 def _measure_contrast(picture: np.ndarray) -> np.ndarray:
     """Return the contrast ``[h,w]`` of each pixel of a picture ``[h,w,3]``, relative to its brightness."""
-    grey = picture.mean(-1)
+    grey = mean_columns(picture)
     fine = np.abs(grey - blur(grey, FINE))
     return np.asarray(blur(fine, AROUND) / (blur(grey, AROUND) + np.float32(DARK)))
 
 
 def _measure_fine(photo: np.ndarray) -> float:
     """Return the mean second difference of pixels in every LINES-th line of a photo, relative to its brightness."""
-    lines = photo[::LINES].mean(-1)
+    lines = mean_columns(photo[::LINES])
     return float(np.abs(np.diff(lines, 2, axis=1)).mean() / (lines.mean() + DARK))
 
 

@@ -339,7 +339,7 @@ def _find_hidden(scene: PicturedScene, changes: Sequence[PhotoChange]) -> tuple[
         difference = (photo - picture) * weights[..., None]
         red, green, blue = np.moveaxis(np.abs(convolve(difference, window, window)), -1, 0)
         differs = known & ((red + green + blue) / 3 > EXPOSURE_STEP * around)
-        return fill_gaps(differs[..., None], known)[..., 0]
+        return fill_gaps(differs[..., None], known)[..., 0] if differs.any() else differs
 
     def compare_drawn(views: np.ndarray, drawn: RowPicture) -> None:
         """Compare the photos of ``views`` with a drawing, and update ``hidden`` and ``pictures`` of these views."""

@@ -11,6 +11,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
+from gsmerge.arrays import max_columns
 from gsmerge.method.raster import TiledView, render
 from gsmerge.method.raster.composite import composite
 from gsmerge.method.raster.images import tile_views, tiles_near
@@ -52,7 +53,7 @@ def mask_background(scene: PicturedScene) -> tuple[PicturedScene, str]:
     importance = np.ones(counts.shape, np.float32) if scene.importance is None else scene.importance.copy()
     for view, part in parts.items():
         photo = images[view]
-        is_alike = np.abs(photo - np.median(photo[part], 0)).max(-1) <= NOISE
+        is_alike = max_columns(np.abs(photo - np.median(photo[part], 0))) <= NOISE
         if is_alike[part].mean() >= LEAST_ALIKE:
             # an object of the background's colour is solid; large Gaussians reach over its edge, and are not
             alpha = render(scene.gaussians, scene.cameras[[view]]).alphas[0, ..., 0]

@@ -14,7 +14,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from gsmerge.arrays import distinct
+from gsmerge.arrays import distinct, max_columns, mean_columns
 from gsmerge.method.compare.view_pictures import fit_size
 from gsmerge.method.geometry.transforms import camera_centres, camera_depths, project, sh0_to_rgb
 from gsmerge.method.kernels.pictures import convolve
@@ -132,7 +132,7 @@ def _find_new_colors(scene: PicturedScene, rows: np.ndarray) -> np.ndarray:
         low = cv2.erode(photo, SQUARE_3).reshape(-1, 3)[places]
         high = cv2.dilate(photo, SQUARE_3).reshape(-1, 3)[places]
         beyond = np.maximum(low - colors, colors - high).clip(0)
-        return np.where(seen, beyond.mean(-1), np.float32(np.inf))
+        return np.where(seen, mean_columns(beyond), np.float32(np.inf))
 
     distances = np.stack(parallel_map(compare, scene.photo_views))
     # a Gaussian whose depth is wrong may be seen by one other photo alone, and not by that from which its colour is
@@ -152,7 +152,7 @@ def _find_moved(scene: PicturedScene, rows: np.ndarray) -> np.ndarray:
     for view in distinct(homes):
         ids = np.flatnonzero(homes == view)
         (places,), (depths,) = project(scene.gaussians.means[rows[ids]], scene.cameras[[view]])
-        distances = np.abs(places - centres[ids]).max(-1)
+        distances = max_columns(np.abs(places - centres[ids]))
         moved[ids] = (depths <= 0) | ~(distances < least)  # also where a distance is not a number
     return moved if moved.mean() <= MOST_EDITED else np.zeros_like(moved)
 
@@ -212,7 +212,7 @@ def _find_deleted(scene: PicturedScene, rows: np.ndarray) -> np.ndarray:
             continue
         photo = cv2.resize(scene.images[view], (width, height), interpolation=cv2.INTER_NEAREST).reshape(-1, 3)
         seen, places, _ = _look_up(means, scene, view, width, height)
-        distances = np.abs(colors[seen] - photo[places[seen]]).mean(-1)
+        distances = mean_columns(np.abs(colors[seen] - photo[places[seen]]))
         least = np.ones(width * height, np.float32)
         np.minimum.at(least, places[seen], distances)
         small = cv2.resize(part.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST).reshape(-1) > 0
@@ -271,7 +271,7 @@ def _measure_lost(scene: PicturedScene, rows: np.ndarray) -> list[np.ndarray]:
             for step_across in (-1, 0, 1):
                 line = (down + step_down).clip(0, height - 1)
                 column = (across + step_across).clip(0, width - 1)
-                is_same = np.abs(own - photo[line, column]).mean(-1) < OTHER
+                is_same = mean_columns(np.abs(own - photo[line, column])) < OTHER
                 lost[line[is_same], column[is_same]] = False
         share = convolve(lost.astype(np.float32), window, window)
         _, labels = cv2.connectedComponents((share > DENSE).astype(np.uint8), connectivity=8)
@@ -308,7 +308,7 @@ def _find_different(share: np.ndarray, weak: float, photo: np.ndarray, picture: 
     is_dense = cv2.resize(cv2.dilate(core, SQUARE_3), size, interpolation=cv2.INTER_NEAREST) > 0
     is_near = cv2.resize(cv2.dilate(around, SQUARE_3), size, interpolation=cv2.INTER_NEAREST) > 0
     mean = np.full(3, 1 / 3, np.float32)
-    differs = is_near & (convolve(np.abs(picture - photo).mean(-1), mean, mean) > OTHER)
+    differs = is_near & (convolve(mean_columns(np.abs(picture - photo)), mean, mean) > OTHER)
     _, labels = cv2.connectedComponents(differs.astype(np.uint8), connectivity=4)
     cover = np.isin(labels, labels[is_dense & differs]).astype(np.uint8)
     # what is left of single pixels goes, and gaps where colours are alike by chance are closed

@@ -12,6 +12,7 @@ from itertools import combinations
 import cv2
 import numpy as np
 
+from gsmerge.arrays import mean_columns
 from gsmerge.frozen import dataclass
 from gsmerge.method.geometry.transforms import nearest_views, project, sh0_to_rgb
 from gsmerge.method.geometry.views import take_rows
@@ -151,7 +152,7 @@ def _ask_others(scene: Scene, view: int) -> _Answers:
         inside &= front_depth > 0
         behind = np.where(inside, log(np.where(inside, front_depth / np.where(inside, depth, 1), 1)), 0)
         is_near = inside & (np.abs(behind) <= SAME_LOG_DEPTH)
-        differs = np.abs(sh0_to_rgb(gaussians.sh0[np.maximum(front, 0), 0]) - colors).mean(-1) > OTHER_COLOR
+        differs = mean_columns(np.abs(sh0_to_rgb(gaussians.sh0[np.maximum(front, 0), 0]) - colors)) > OTHER_COLOR
         num_denying += (inside & (behind > THROUGH)) | (is_near & differs)
         num_confirming += is_near & ~differs
     seen = num_denying + num_confirming > 0

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
+from gsmerge.arrays import max_columns, mean_columns
 from gsmerge.frozen import dataclass, replace
 from gsmerge.method.compare.view_pictures import fit_size
 from gsmerge.method.geometry.transforms import median, medians, project
@@ -101,7 +102,7 @@ def _grow_in_photos(scene: PicturedScene, part: np.ndarray) -> np.ndarray:
     overlay = np.repeat(part[None], len(scene), 0)
     covered = scene.images[views][:, part]
     usual = medians(covered)
-    differences = np.abs(covered - usual).max(-1)
+    differences = max_columns(np.abs(covered - usual))
     noise = median(differences)
     if noise > OPAQUE:
         return overlay
@@ -125,7 +126,7 @@ def find_overlay(scene: PicturedScene) -> np.ndarray | None:
     size = fit_size((scene.cameras.width, scene.cameras.height), SIDE)
     photos = np.stack([cv2.resize(scene.images[view], size, interpolation=cv2.INTER_AREA) for view in views])
     first = _vote(scene, views, photos, step=2, partners=QUICK_PARTNERS)
-    slopes = np.stack([np.stack(sobel(photo.mean(-1)), -1) / 8 for photo in photos])
+    slopes = np.stack([np.stack(sobel(mean_columns(photo)), -1) / 8 for photo in photos])
     usual_slopes = medians(slopes)
     near_edge = _grow(_find_edges(slopes, usual_slopes, first.noise), SMALL)
     if (first.seeds & near_edge[::2, ::2]).mean() < LEAST_SEEDS:
@@ -135,11 +136,11 @@ def find_overlay(scene: PicturedScene) -> np.ndarray | None:
     edges = _find_edges(slopes, usual_slopes, by_slope.noise)
     seeds = by_color.seeds | (by_slope.seeds & edges)
     picture = medians(photos)
-    is_constant = np.abs(photos - picture).mean(-1).mean(0) < by_color.noise / 2
+    is_constant = mean_columns(np.abs(photos - picture)).mean(0) < by_color.noise / 2
     joined = seeds | is_constant | (edges & _grow(seeds, BESIDE))
     joined = cv2.morphologyEx(joined.astype(np.uint8), cv2.MORPH_CLOSE, SMALL)
     number, labels = cv2.connectedComponents(joined, connectivity=8)
-    texture = np.abs(picture - blur(picture, 1.5)).mean(-1)
+    texture = mean_columns(np.abs(picture - blur(picture, 1.5)))
     has_row, depths = _describe_rows(scene, views, size)
     near_edge = _grow(edges, SMALL)
     near_seed = _grow(seeds, SMALL)
@@ -188,10 +189,10 @@ def _vote(scene: PicturedScene, views: Sequence[int], values: np.ndarray, *, ste
             u = np.where(inside, u, 0)
             v = np.where(inside, v, 0)
             moved = inside & (np.abs(u - x) + np.abs(v - y) > MOVED)
-            near_error, far_error = np.abs(own - sample_bilinear(values[other], u, v)).mean(-1)
+            near_error, far_error = mean_columns(np.abs(own - sample_bilinear(values[other], u, v)))
             tells.append(moved[0] & (rows >= 0))
             by_rows.append(np.where(moved[1], np.minimum(near_error, far_error), near_error))
-            by_pixel.append(np.abs(own - values[other, ::step, ::step]).mean(-1))
+            by_pixel.append(mean_columns(np.abs(own - values[other, ::step, ::step])))
     told = np.stack(tells)
     row_errors = np.stack(by_rows)
     pixel_errors = np.stack(by_pixel)

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
+from gsmerge.arrays import mean_columns
 from gsmerge.frozen import dataclass, replace
 from gsmerge.method.compare.view_pictures import fit_size
 from gsmerge.method.geometry.transforms import camera_depths, median, nearest_views, project
@@ -134,7 +135,7 @@ def _find_part(own: SmallView, others: Sequence[SmallView]) -> np.ndarray:
     differs = cv2.morphologyEx(differs.astype(np.uint8), cv2.MORPH_CLOSE, SQUARE_3)
     differs = cv2.morphologyEx(differs, cv2.MORPH_OPEN, SQUARE_3)
     _, labels, stats, _ = cv2.connectedComponentsWithStats(differs, connectivity=8)
-    contrast = (cv2.dilate(own.photo, SQUARE_5) - cv2.erode(own.photo, SQUARE_5)).mean(-1)
+    contrast = mean_columns(cv2.dilate(own.photo, SQUARE_5) - cv2.erode(own.photo, SQUARE_5))
     areas = stats[:, cv2.CC_STAT_AREA]
     near_edges = np.bincount(labels[contrast > EDGE], minlength=len(areas))
     is_thing = (areas >= LEAST_PART * differs.size) & (near_edges >= NEAR_EDGES * areas)
@@ -179,14 +180,14 @@ def _compare(own: SmallView, others: Sequence[SmallView]) -> tuple[np.ndarray, n
     shows = (layers > 0) & (layers * THROUGH * THROUGH > layers.max(0)) & (layers < FAR * median(own.depths[own.known]))
     count = shows.sum(0)
     mean = (pictures * shows[..., None]).sum(0) / np.maximum(count, 1)[..., None]
-    spread = (np.abs(pictures - mean).mean(-1) * shows).sum(0) / np.maximum(count, 1)
+    spread = (mean_columns(np.abs(pictures - mean)) * shows).sum(0) / np.maximum(count, 1)
     agree = (count >= 2) & (2 * count > (layers > 0).sum(0))
-    differs = seen_through & agree & (np.abs(own.photo - mean).mean(-1) > OTHER * spread + NOISE)
+    differs = seen_through & agree & (mean_columns(np.abs(own.photo - mean)) > OTHER * spread + NOISE)
     # no view shows the photo's colour, at whatever depth, also not beside the pixel, where wrong depths may put it
     lines, columns = np.nonzero(differs)
     beside = np.arange(3)
     framed = np.pad(pictures, ((0, 0), (1, 1), (1, 1), (0, 0)), constant_values=NO_COLOR)
     around = framed[:, lines[:, None, None] + beside[:, None], columns[:, None, None] + beside]
     colors = own.photo[lines, columns][:, None, None]
-    differs[lines, columns] = ~(np.abs(around - colors).mean(-1) < NOISE).any((0, 2, 3))
+    differs[lines, columns] = ~(mean_columns(np.abs(around - colors)) < NOISE).any((0, 2, 3))
     return seen_through, differs

@@ -11,6 +11,7 @@ from typing import cast
 
 import numpy as np
 
+from gsmerge.arrays import max_columns
 from gsmerge.errors import count_words
 from gsmerge.frozen import dataclass, replace
 from gsmerge.method.facts.pictures import PHOTOS, RENDERS, ROW_COLORS
@@ -268,7 +269,7 @@ def fill_scene(p: Prepared, options: PrepareOptions) -> Prepared:
         added += ", which is usual: the model left the borders of its pictures out, and perhaps the sky"
     drawn = ""
     if scene.images is not p.scene.images:
-        is_drawn = np.stack([(a != b).any(-1) for a, b in zip(p.scene.images, scene.images, strict=True)])
+        is_drawn = np.stack([max_columns(a != b) for a, b in zip(p.scene.images, scene.images, strict=True)])
         if is_drawn.any():
             where = (
                 f"{is_drawn.any((1, 2)).sum()} of {len(scene)} pictures ({100 * is_drawn.mean():.1f} % of all pixels)"
@@ -364,7 +365,7 @@ def has_changed(photos: np.ndarray, scene: PicturedScene, views: Sequence[int], 
         return False
     counting = counting_pixels(scene)
     return any(
-        not np.array_equal(before[counting[view]], scene.images[view][counting[view]])
+        (max_columns(before != scene.images[view]) & counting[view]).any()
         for before, view in zip(photos, repeated, strict=True)
         if view in views
     )

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
+from gsmerge.arrays import mean_columns
 from gsmerge.frozen import dataclass, replace
 from gsmerge.method.compare.similarity import stands_out
 from gsmerge.method.compare.view_pictures import fit_size
@@ -90,7 +91,8 @@ def divide_by_vignette(scene: PicturedScene) -> tuple[PicturedScene, np.ndarray 
         return scene, None, ""
     views = [views[i] for i in even_views(len(views), min(len(views), MOST_VIEWS))]
     size = fit_size((scene.cameras.width, scene.cameras.height), CELLS)
-    small = np.stack([cv2.resize(scene.images[view].mean(-1), size, interpolation=cv2.INTER_AREA) for view in views])
+    greys = (mean_columns(scene.images[view]) for view in views)
+    small = np.stack([cv2.resize(grey, size, interpolation=cv2.INTER_AREA) for grey in greys])
     usual = medians(small.reshape(len(small), -1).T)[:, None, None]
     is_dark = small < DARK * usual
     if is_dark.all(0).mean() < LEAST_SHARE:  # no place is dark in all photos, as in nearly all scenes
@@ -98,7 +100,7 @@ def divide_by_vignette(scene: PicturedScene) -> tuple[PicturedScene, np.ndarray 
     light = _find_light(scene, views)
     if light is None or (light < DARK * median(light)).mean() < LEAST_SHARE:
         return scene, None, ""
-    brightest = np.max([scene.images[view].mean(-1) for view in views], axis=0)
+    brightest = np.max([mean_columns(scene.images[view]) for view in views], axis=0)
     black = np.broadcast_to((light < BLACK) | (brightest < NOISE_LEVEL), scene.images.shape[:3])
     change = PhotoChange(light=light.clip(BLACK))
     images = np.stack(parallel_map(change, list(scene.images)))
@@ -168,7 +170,7 @@ def _find_light(scene: PicturedScene, views: Sequence[int]) -> np.ndarray | None
 
 def _compare_surfaces(scene: PicturedScene, views: Sequence[int]) -> _Quotients:
     """Compare the brightnesses of surfaces that each of ``views`` shows with those in other photos."""
-    brightness = scene.images.mean(-1).reshape(len(scene), -1)
+    brightness = mean_columns(scene.images).reshape(len(scene), -1)
 
     def compare(view: int, other: int, rows: np.ndarray, other_rows: np.ndarray) -> _Quotients | None:
         """Compare two photos."""

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
+from gsmerge.arrays import max_columns
 from gsmerge.frozen import dataclass, replace
 from gsmerge.io.formats.write import round_as_written
 from gsmerge.method.facts.prepared import Prepared
@@ -43,7 +44,7 @@ def measure_renders(gaussians: Gaussians, prepared: Prepared, plan: ScorePlan) -
 def may_leave_gaps(prepared: Prepared, plan: ScorePlan) -> bool:
     """Return whether the input may leave gaps, because more than a few pixels are black in its renders."""
     pictures = (prepared.scene.images[view] for view in plan.views)
-    return bool(np.mean([(picture.max(-1) > ROUNDING).mean() for picture in pictures]) < WHOLE_SHARE)
+    return bool(np.mean([(max_columns(picture) > ROUNDING).mean() for picture in pictures]) < WHOLE_SHARE)
 
 
 def round_for_output(gaussians: Gaussians, plan: ScorePlan) -> Gaussians:

@@ -1,4 +1,4 @@
-"""Pictures as Python code has them: of bytes, of numbers up to 255, beyond [0, 1]."""
+"""Pictures as Python code has them: of bytes, of numbers up to 255, beyond [0, 1]; their channels are reduced alike."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import scenes
 
 import gsmerge
 from gsmerge import Scene
-from gsmerge.arrays import as_pictures
+from gsmerge.arrays import as_pictures, max_columns, mean_columns
 from gsmerge.types import Views
 
 QUICK = {"effort": "draft", "fit": "none", "checkpoint": "none"}
@@ -51,3 +51,13 @@ def test_pictures_beyond_their_range_are_refused_with_a_remedy(scene: Scene, cha
 def test_pictures_that_rounding_left_above_1_are_taken(scene: Scene) -> None:
     images = scene.images * np.float32(1.001)
     assert as_pictures(images) is images
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("shape", [(7, 5, 3), (2, 7, 5, 3), (11, 2), (0, 3)])
+def test_few_columns_are_reduced_with_the_bits_of_numpy(shape: tuple[int, ...], dtype: type[np.floating[Any]]) -> None:
+    values = np.random.default_rng(0).normal(size=shape).astype(dtype)
+    assert np.array_equal(mean_columns(values), values.mean(-1))
+    assert mean_columns(values).dtype == dtype
+    assert np.array_equal(max_columns(values), values.max(-1))
+    assert np.array_equal(max_columns(values > 0), (values > 0).any(-1))

@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from gsmerge.arrays import mean_columns
 from gsmerge.frozen import dataclass
 from gsmerge.method.compare.similarity import stands_out
 from gsmerge.method.compare.view_pictures import Pairs
@@ -43,7 +44,7 @@ class Blocks:
 
     def distances(self, colors: np.ndarray, views: Sequence[int] | slice = slice(None)) -> np.ndarray:
         """Return the mean difference ``[n]`` of photo and ``colors [v,H,W,3]`` in each block; NaN in faint blocks."""
-        differences = np.abs(self.photos - colors).mean(-1)
+        differences = mean_columns(np.abs(self.photos - colors))
         return np.where(self.solid, differences, np.nan)[views].reshape(-1)
 
 

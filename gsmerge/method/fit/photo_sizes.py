@@ -165,7 +165,8 @@ def holdout_psnr(images: Sequence[np.ndarray], photos: Photos, weights: list[np.
         image = clipped[view]
         weight = weights[view][..., None]
         photo_products, image_squares = (
-            (weight * picture * image).sum((0, 1), dtype=np.float64) for picture in (photos.images[view], image)
+            [channel.sum(dtype=np.float64) for channel in np.moveaxis(weight * picture * image, -1, 0)]
+            for picture in (photos.images[view], image)
         )
         return np.clip(photo_products / np.maximum(image_squares, 1e-9), 1 / MAX_GAIN, MAX_GAIN)
 

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from gsmerge.frozen import dataclass, replace
-from gsmerge.method.geometry.transforms import sh0_to_rgb
+from gsmerge.method.geometry.transforms import median, sh0_to_rgb
 from gsmerge.method.kernels.raster.project import TILE
 from gsmerge.method.raster.composite import composite
 from gsmerge.method.raster.metrics import MAX_PSNR, psnr_within
@@ -192,7 +192,7 @@ def counting_pixels(scene: Scene) -> np.ndarray:
 def row_shares(scene: Scene) -> np.ndarray:
     """Return how many pixels of each view ``[v]`` have a Gaussian, relative to how many views usually have."""
     shares = scene.get_pixels().shown.mean((1, 2))
-    return np.asarray(shares / max(float(np.median(shares)), 1e-9))
+    return np.asarray(shares / max(median(shares), 1e-9))
 
 
 def pixel_weights(masks: np.ndarray | None, width: int, height: int) -> np.ndarray | None:
