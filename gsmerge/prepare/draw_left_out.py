@@ -13,7 +13,7 @@ import numpy as np
 
 from gsmerge.arrays import max_columns
 from gsmerge.method.raster import TiledView, render
-from gsmerge.method.raster.composite import composite
+from gsmerge.method.raster.composite import composite, find_covered
 from gsmerge.method.raster.images import tile_views, tiles_near
 from gsmerge.method.raster.photos import COVERED_TRANSMITTANCE, counting_pixels
 from gsmerge.prepare.fill_holes import find_bare, large_parts
@@ -89,23 +89,26 @@ def draw_left_out(scene: PicturedScene, masks: np.ndarray | None) -> PicturedSce
     # in a view with a hole all is drawn, in others what lies near left-out pixels
     drawn = [view for view in range(len(scene)) if outside[view].any() or holes[view].any()]
     parts = {view: tiles_near(outside[view], 2 * HOLE * unit) for view in drawn if not holes[view].any()}
-    colors = np.zeros_like(scene.images)
-    transmittance = np.ones(counts.shape, np.float32)
+    bare = np.ones(counts.shape, bool)
+    own = scene.has_own_pixels
+    # pictures already have the colours of the views' own Gaussians, which are solid
+    colors = scene.images.copy() if own else np.zeros_like(scene.images)
+    transmittance = np.zeros(counts.shape, np.float32) if own else np.ones(counts.shape, np.float32)
 
     def draw(view: int, tiled: TiledView) -> None:
-        """Draw a view of the input."""
-        colors[view], transmittance[view] = composite(tiled)
+        """Draw a view of the input, or find only where the input shows nothing."""
+        if own:
+            bare[view] = ~find_covered(tiled, float(COVERED_TRANSMITTANCE))
+            return
+        image, transmittance[view] = composite(tiled)
+        colors[view] = image.clip(0, 1)
+        bare[view] = transmittance[view] > COVERED_TRANSMITTANCE
 
     tile_views(scene, draw, drawn, parts)
-    colors = colors.clip(0, 1)
-    bare = transmittance > COVERED_TRANSMITTANCE
+    solid = ~find_bare(scene) if own else np.zeros_like(bare)
     if scene.beyond is not None:  # nothing is known there
         bare &= ~scene.beyond
-    solid = np.zeros_like(bare) if scene.beyond is None else scene.beyond
-    if scene.has_own_pixels:  # pictures already have the colours of the views' own Gaussians, which are solid
-        colors = scene.images.copy()
-        transmittance = np.zeros_like(transmittance)
-        solid = ~find_bare(scene)
+        solid = solid if own else scene.beyond
     for view, hole in enumerate(holes):
         left_out = outside[view]
         nothing = _grow(~_grow(~bare[view], HOLE * unit), HOLE * unit)

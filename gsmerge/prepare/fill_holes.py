@@ -19,7 +19,7 @@ from gsmerge.method.kernels.matrices import matmul
 from gsmerge.method.kernels.pictures import blur
 from gsmerge.method.kernels.reproject import add_differences
 from gsmerge.method.raster import TiledView
-from gsmerge.method.raster.composite import blend_depths
+from gsmerge.method.raster.composite import blend_depths, find_covered
 from gsmerge.method.raster.images import tile_views, tiles_near
 from gsmerge.prepare.photo_change import PhotoChange, change_large
 from gsmerge.runtime.record import list_some, note
@@ -59,6 +59,49 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = Fa
     ``everywhere``, large empty parts are filled, too. In a cropped scene, all pixels without Gaussians stay empty.
     A note says what stays empty.
     """
+    found = _find_holes(scene, shown, everywhere=everywhere)
+    if found is None:
+        return scene
+    views, holes, empty, edges = found.views, found.holes, found.empty, found.edges
+    refused = [scene.names[view] for view in sorted(edges) if edges[view].known is None]
+    if scene.depths is not None and refused:
+        why = "the depths of their views' Gaussians do not confirm them"
+        note(f"the depth maps of {len(refused)} of {len(scene)} views are not used: {why} ({list_some(refused)})")
+    if edges and np.count_nonzero(found.bare[views]) < MOST_EMPTY * np.count_nonzero(~empty[views]):
+        ids = sorted(edges)
+        added = Gaussians.concat(parallel_map(lambda view: _fill_view(scene, view, holes[view], edges[view]), ids))
+        holes[[view for view in range(len(scene)) if view not in edges]] = False
+        pixels = np.flatnonzero(holes)
+        if scene.region is not None:
+            inside = lies_inside(scene.region, added.means)
+            added = added[inside]
+            pixels = pixels[inside]
+        scene = fill_pixels(scene, added, pixels)
+    return _leave_empty(scene, empty)
+
+
+@dataclass(frozen=True, eq=False)
+class _Edges:
+    """Depths in a view around its n holes."""
+
+    beside: np.ndarray  # [n] depth of the surface beside each hole, or in it if a depth map knows all holes
+    farthest: float  # Depth of the view's farthest surface
+    known: np.ndarray | None = None  # [n] depth of each hole in the view's depth map, NaN without one
+
+
+@dataclass(frozen=True, eq=False)
+class _Holes:
+    """What is missing in the views of a scene."""
+
+    views: list[int]  # views with pixels that may be filled, or with large empty parts
+    bare: np.ndarray  # [v,h,w] bool, other pixels of these views that no Gaussian covers enough
+    holes: np.ndarray  # [v,h,w] bool, those of them that can be filled
+    empty: np.ndarray  # [v,h,w] bool, pixels that stay empty
+    edges: dict[int, _Edges]  # of the views with holes
+
+
+def _find_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool) -> _Holes | None:
+    """Find the holes of all views, and the parts that stay empty; see :func:`fill_holes`. None if there are none."""
     fronts = scene.get_pixels().fronts
     is_cropped = scene.region is not None
     beyond = scene.beyond
@@ -66,18 +109,28 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = Fa
     bare = find_bare(scene)
     has_empty = np.array([is_cropped or (not everywhere and large_parts(part).any()) for part in bare])
     views = [view for view in range(len(scene)) if has_empty[view] or fillable[view].any()]
-    if not views:
-        return scene
     holes, empty, edges = np.zeros_like(fillable), np.zeros_like(fillable), dict[int, _Edges]()
+    if not views:
+        return None
     gap = 2 * round(GAP_WIDTH * max(shown.shape[1:]) / 2) + 1
     # Where each pixel has its own Gaussians, a view without an empty part needs to be drawn only at its holes, and
     # around them if the depth beside them counts. A view of few Gaussians does not know its farthest surface
     around = gap if scene.depths is None else 0
     knows = scene.has_own_pixels & ~has_empty & (fillable.mean((1, 2)) < MOST_EMPTY)
     parts = {view: tiles_near(fillable[view], around) for view in views if knows[view]}
+    num_own = np.count_nonzero(fronts >= 0, axis=(1, 2))
 
     def find_holes(view: int, tiled: TiledView) -> None:
         """Mark a view's pixels that stay empty, other pixels that its drawing does not cover, and holes to fill."""
+        pixels, own_depths = _sample_own(scene, view)
+        is_whole = view in parts and 2 * num_own[view] >= fronts[view].size
+        known = _fit_map(scene, view, pixels, own_depths) if is_whole else None
+        if known is not None and np.isfinite(known[fillable[view]]).all():  # no hole needs the depth beside it
+            holes[view] = bare[view] = fillable[view] & ~find_covered(tiled, 1 - HOLE_OPACITY)
+            if holes[view].any():
+                (farthest,) = quantiles(own_depths, [FARTHEST_QUANTILE])
+                edges[view] = _Edges(known[holes[view]], float(farthest), known[holes[view]])
+            return
         depths, transmittance = blend_depths(tiled)
         covered = transmittance <= 1 - HOLE_OPACITY
         if view in parts:
@@ -94,28 +147,17 @@ def fill_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool = Fa
             holes[view] &= cv2.morphologyEx(covered.astype(np.uint8), cv2.MORPH_CLOSE, window) > 0
         if covered.any() and holes[view].any():
             beside = fill_gaps(depths[..., None], covered)[..., 0]
-            pixels, own_depths = _sample_depths(scene, view, depths, covered)
+            if 2 * num_own[view] < np.count_nonzero(covered):  # the view has lost its rows, and other views know more
+                pixels = np.flatnonzero(covered)
+                pixels = pixels[:: 1 + len(pixels) // SAMPLE]
+                own_depths = depths.reshape(-1)[pixels].astype(np.float64)
             known = _fit_map(scene, view, pixels, own_depths)
             surfaces = own_depths if view in parts and own_depths.size else depths[covered]
             (farthest,) = quantiles(surfaces, [FARTHEST_QUANTILE])
             edges[view] = _Edges(beside[holes[view]], float(farthest), None if known is None else known[holes[view]])
 
     tile_views(scene, find_holes, views, parts)
-    refused = [scene.names[view] for view in sorted(edges) if edges[view].known is None]
-    if scene.depths is not None and refused:
-        why = "the depths of their views' Gaussians do not confirm them"
-        note(f"the depth maps of {len(refused)} of {len(scene)} views are not used: {why} ({list_some(refused)})")
-    if edges and np.count_nonzero(bare[views]) < MOST_EMPTY * np.count_nonzero(~empty[views]):
-        ids = sorted(edges)
-        added = Gaussians.concat(parallel_map(lambda view: _fill_view(scene, view, holes[view], edges[view]), ids))
-        holes[[view for view in range(len(scene)) if view not in edges]] = False
-        pixels = np.flatnonzero(holes)
-        if scene.region is not None:
-            inside = lies_inside(scene.region, added.means)
-            added = added[inside]
-            pixels = pixels[inside]
-        scene = fill_pixels(scene, added, pixels)
-    return _leave_empty(scene, empty)
+    return _Holes(views, bare, holes, empty, edges)
 
 
 def fill_pixels(scene: PicturedScene, added: Gaussians, empty_pixels: np.ndarray) -> PicturedScene:
@@ -159,30 +201,11 @@ def usual_opacity(opacity: np.ndarray) -> float:
     return float((opacity * opacity).sum() / max(float(opacity.sum()), 1e-6))
 
 
-@dataclass(frozen=True, eq=False)
-class _Edges:
-    """Depths in a view around its n holes."""
-
-    beside: np.ndarray  # [n] depth of the surface beside each hole
-    farthest: float  # Depth of the view's farthest surface
-    known: np.ndarray | None = None  # [n] depth of each hole in the view's depth map, NaN without one
-
-
-def _sample_depths(
-    scene: PicturedScene, view: int, depths: np.ndarray, covered: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return pixels ``[p]`` of a view that have a Gaussian, at most about SAMPLE, and the depths ``[p]`` of these.
-
-    If the view has lost its rows, so that its drawing, ``depths [h,w]``, has more than twice as many pixels that are
-    ``covered [h,w]``, the depths of the drawing are returned, which other views know.
-    """
+def _sample_own(scene: PicturedScene, view: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return pixels ``[p]`` of a view that have a Gaussian, at most about SAMPLE, and the depths ``[p]`` of these."""
     fronts = scene.get_pixels().fronts[view].reshape(-1)
-    own = np.flatnonzero(fronts >= 0)
-    is_lost = 2 * len(own) < np.count_nonzero(covered)
-    pixels = np.flatnonzero(covered) if is_lost else own
+    pixels = np.flatnonzero(fronts >= 0)
     pixels = pixels[:: 1 + len(pixels) // SAMPLE]
-    if is_lost:
-        return pixels, depths.reshape(-1)[pixels].astype(np.float64)
     means = scene.gaussians.means[fronts[pixels]].astype(np.float64)
     return pixels, camera_depths(means, scene.cameras.viewmats[view])
 

@@ -69,6 +69,14 @@ def blend_depths(tiled: TiledView, farthest: float = np.inf) -> tuple[Array, Arr
     return blended[..., 0] / np.maximum(1 - transmittance, np.float32(min_opacity)), transmittance
 
 
+def find_covered(tiled: TiledView, limit: float) -> Array:
+    """Return a mask ``[h,w]`` of the pixels of a view whose transmittance is at most ``limit``; it draws no more."""
+    covered = np.empty((tiled.height, tiled.width), np.uint8)
+    with use_threads() as threads:
+        parallel_map(lambda span: kernels.cover(*tiled.lists, *span, limit, covered), tile_ranges(tiled, threads))
+    return covered.view(bool)
+
+
 def composite(tiled: TiledView, colors: Array | None = None, background: ArrayLike = 0.0) -> tuple[Array, Array]:
     """Blend the Gaussians of a view front to back into an image.
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from made_gaussians import random_gaussians
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from slow_renderer import render_arrays
 
 from gsmerge.method.geometry.transforms import quat_to_rotmat
@@ -18,6 +18,7 @@ from gsmerge.method.kernels.raster.blend import (
     blend,
     blend_backward,
     contributions,
+    cover,
     gather_slots,
     parts_of_tile,
     survey,
@@ -25,6 +26,7 @@ from gsmerge.method.kernels.raster.blend import (
 )
 from gsmerge.method.kernels.raster.list_weights import LANES, collect, list_weights
 from gsmerge.method.raster import TiledView, composite, make_splats, splat_adjoint, tile_view
+from gsmerge.method.raster.composite import find_covered
 from gsmerge.types import Gaussians
 
 WIDTH, HEIGHT = 45, 37  # not multiples of a tile
@@ -121,6 +123,14 @@ def test_transposed_product_matches_adjoint_and_dense_matrix(channels: int) -> N
     assert not expected[left_out].any()
 
 
+@pytest.mark.parametrize("limit", [0.25, 0.9, 0.001])
+@pytest.mark.parametrize("case", CASES)
+def test_covered_pixels_are_those_of_the_transmittance(case: tuple[int, int, float], limit: float) -> None:
+    """A tile ends early, but no pixel changes sides."""
+    tiled, _ = tile_and_weigh(of_case(case))
+    assert_array_equal(find_covered(tiled, limit), composite(tiled)[1] <= limit)
+
+
 def test_weights_match_the_slow_renderer() -> None:
     gaussians = random_gaussians(200, 7)
     _, weights = tile_and_weigh(gaussians)
@@ -185,6 +195,7 @@ def walks(given: dict[str, Any], first: int = 0, last: int = 4) -> list[Any]:
         lambda: contributions(*walked, SIDE, SIDE, np.zeros((M, 2), np.float32)),
         lambda: blend_backward(*walked, colors, first, last, image, left, image, None, slots),
         lambda: list_weights(*walked, SIDE, SIDE),
+        lambda: cover(*walked, first, last, 0.5, np.empty((SIDE, SIDE), np.uint8)),
     ]
 
 
@@ -205,14 +216,14 @@ def test_walks_take_sound_lists() -> None:
         pytest.param({"tile_width": 0}, id="no columns"),
     ],
 )
-@pytest.mark.parametrize("walk", range(6))
+@pytest.mark.parametrize("walk", range(7))
 def test_walks_refuse_lists_outside_their_arrays(walk: int, change: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match="indices"):
         walks(lists(**change))[walk]()
 
 
 @pytest.mark.parametrize("span", [(-1, 2), (0, 5), (0, 1 << 62)])
-@pytest.mark.parametrize("walk", [0, 1, 4])
+@pytest.mark.parametrize("walk", [0, 1, 4, 6])
 def test_tiles_that_are_not_there_are_refused(walk: int, span: tuple[int, int]) -> None:
     with pytest.raises(ValueError, match="indices"):
         walks(lists(), *span)[walk]()

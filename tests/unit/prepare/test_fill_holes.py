@@ -250,6 +250,20 @@ def test_a_depth_map_counts_where_few_gaussians_tell_its_unit() -> None:
     assert np.median(np.abs(np.log(1.7 * depths_of(filled)[1][new] / maps[1][new]))) < 0.01
 
 
+def test_a_depth_map_fills_a_hole_beside_which_nothing_is_covered(tmp_path: Path) -> None:
+    """All of the tiles that the hole touches are bare, so no drawing knows a depth beside it."""
+    tiny = smooth_scene(96, 72)
+    scene = load_scene(save_export(tmp_path, tiny, export_rows(tiny))).scene
+    kept = scene.pixels.shown.copy()
+    kept[:, 2:46, 18:78] = False
+    holed = PicturedScene.with_pictures(scenes.shown_in(scene, kept), scene.images, None)
+    shown = np.zeros_like(kept)
+    shown[1, 16:32, 32:64] = True
+    filled = fill_holes(replace(holed, depths=tiny.depths), shown, everywhere=True)
+    assert np.array_equal(new_in(filled, holed), shown)
+    assert np.allclose(depths_of(filled)[shown], tiny.depths[shown], rtol=1e-3)
+
+
 @pytest.mark.parametrize("is_right", [True, False])
 def test_other_views_confirm_the_map_of_a_view_that_has_lost_its_rows(tmp_path: Path, *, is_right: bool) -> None:
     """Of its own rows one is left, which confirms nothing."""

@@ -96,6 +96,36 @@ API int32_t blend(const float *restrict conics, const int32_t *restrict flatten_
   return 0;
 }
 
+// Mark the pixels of a range of tiles whose transmittance falls to `limit`. A tile ends where all of its pixels have.
+API int32_t cover(const float *restrict conics, const int32_t *restrict flatten_ids,
+                  const int64_t *restrict isect_offsets, int64_t tile_width, int64_t first, int64_t last, float limit,
+                  uint8_t *restrict covered, int64_t m, int64_t n, int64_t ends, int64_t h, int64_t w) {
+  Lists lists = {conics, flatten_ids, isect_offsets, tile_width, m, n, ends};
+  if (!lists_are_sound(&lists, first, last)) return OUTSIDE;
+  float state[PLANE] __attribute__((aligned(64)));
+  Batch batch;
+  Weights weights[PARTS];
+  clear_batch(&batch);
+  for (int64_t tile = first; tile < last; tile++) {
+    Tile t = open_tile(state, 1, tile, tile_width, h, w);
+    int64_t end = isect_offsets[tile + 1];
+    for (int64_t start = isect_offsets[tile]; start < end && t.y_low <= t.y_high; start += BATCH) {
+      int64_t stop = mini(end, start + BATCH);
+      if (!gather(&batch, &t, &lists, start, stop, end)) return OUTSIDE;
+      for (int64_t j = 0; j < stop - start; j++) {
+        int32_t y0 = first_row(&t, &batch, j), y1 = last_row(&t, &batch, j);
+        if (y0 <= y1) blend_one(state, &batch, j, y0, y1, false, weights);
+      }
+      for (int i = 0; i < PLANE; i++) state[i] = state[i] > limit ? state[i] : -absf4(state[i]);
+      narrow_tile(&t, state);
+    }
+    for (int y = 0; y < t.num_y; y++)
+      for (int x = 0; x < t.num_x; x++)
+        covered[(t.top + y) * w + t.left + x] = absf4(state[y * TILE + x]) <= limit;
+  }
+  return 0;
+}
+
 // The sum of weights times one channel in each column.
 typedef struct { pixels sum; } Channel;
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from gsmerge.method.kernels.raster.binning import MOST_TILES
 from gsmerge.method.kernels.raster.project import CONIC, MAX_SIZE, SUMS
-from gsmerge.method.kernels.signature import STATUS, f4, i4, i8, native
+from gsmerge.method.kernels.signature import STATUS, f4, i4, i8, native, u1
 
 CHANNELS = 4  # number of channels that weighted_sums adds up at a time
 MAX_ALPHA = 0.99  # largest alpha of a Gaussian at a pixel, as in gsplat
@@ -35,6 +35,14 @@ def blend(conics, flatten_ids, isect_offsets, tile_width, colors, first, last, t
 
     ``image`` and ``transmittance`` have the rows of the view from ``top`` on. Tiles that begin outside of the rows of
     ``image`` are left out.
+    """
+
+
+@native(STATUS, **LISTS, **TILES, limit=f4(), covered=u1("h", "w", out=True))
+def cover(conics, flatten_ids, isect_offsets, tile_width, first, last, limit, covered):
+    """Write 1 to ``covered [h,w]`` at pixels of a range of tiles with at most the transmittance ``limit``, 0 at others.
+
+    A tile ends where all of its pixels are covered, so this takes less time than :func:`blend`.
     """
 
 
