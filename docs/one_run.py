@@ -251,13 +251,10 @@ def values_table(run: Run) -> str:
         "| function | array | row |",
         "|---|---|---|",
         entry("find_pixels", "ply.gaussians.means", ply.gaussians.means, ROW),
-        entry("find_pixels", "pixel_ids", made["find_pixels"].pixel_ids, ROW),
         entry("prepare", "scene.gaussians.means", prepared.scene.gaussians.means, ROW),
         entry("segment_scene", "groups.labels", made["segment_scene"].groups.labels, (VIEW, Y, X)),
         entry("correct", "features.covars", features.covars, (run.feature, *DIAGONAL), 4)[:-2] + " (diagonal) |",
-        entry("match", "clusters", made["match"].clusters, run.feature),
         entry("merge", "features.means", merged.means, run.merged),
-        entry("decode_merged", "gaussians.scales", made["decode_merged"].gaussians.scales, run.merged, 4),
         entry("fit_scene", "gaussians.scales", fitted.gaussians.scales, run.fitted[0], 4),
         entry("make_result", "gaussians.means", run.result.gaussians.means, run.written),
     ])  # fmt: skip
