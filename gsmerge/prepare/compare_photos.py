@@ -167,8 +167,11 @@ def find_grey(pairs: Pairs, views: Sequence[int]) -> dict[int, float]:
     for view in views:
         weights = pairs.shown.weights[view].reshape(-1)[::step]
         photo, shown = (images[view].reshape(-1, 3)[::step] for images in (pairs.photos, pairs.shown.pictures))
-        hues, shown_hues = (vary_in_hue(colors, weights) for colors in (photo, shown))
-        if hues < min(VISIBLE, GREY_VARIATION * shown_hues) and shown_hues > VISIBLE and photo.std() > VISIBLE:
+        hues = vary_in_hue(photo, weights)
+        if hues >= VISIBLE or photo.std() <= VISIBLE:  # as in nearly all photos
+            continue
+        shown_hues = vary_in_hue(shown, weights)
+        if hues < GREY_VARIATION * shown_hues and shown_hues > VISIBLE:
             shares[view] = hues / shown_hues
     return shares
 
@@ -330,13 +333,14 @@ def _find_hidden(scene: PicturedScene, changes: Sequence[PhotoChange]) -> tuple[
         """Return a mask of the pixels at which a view's photo differs from ``picture``, in its ``known`` part."""
         around = convolve(known.astype(np.float32), window, window)
         # what is left of a view that has lost its rows is too little to judge the pixels around it
-        known = known & (around > LEAST_JUDGED / spacing**2)
-        weights = known.astype(np.float32)
-        around = convolve(weights, window, window)
+        is_sparse = known & (around <= LEAST_JUDGED / spacing**2)
+        if is_sparse.any():
+            known = known & ~is_sparse
+            around = convolve(known.astype(np.float32), window, window)
         photo = changes[view](scene.images[view])
         if spacing > 1:
             photo = convolve(photo, footprint, footprint)
-        difference = (photo - picture) * weights[..., None]
+        difference = (photo - picture) * known[..., None]
         red, green, blue = np.moveaxis(np.abs(convolve(difference, window, window)), -1, 0)
         differs = known & ((red + green + blue) / 3 > EXPOSURE_STEP * around)
         return fill_gaps(differs[..., None], known)[..., 0] if differs.any() else differs
