@@ -38,8 +38,8 @@ def fit_full(
 ) -> FitResult:
     """Fit all parameters of Gaussians to the photos of a run.
 
-    Held-out patches are scored once the first steps are done. The remaining steps use every patch. After the last step,
-    Gaussians are split at the edges of the views if the photos hardly suffer.
+    Held-out patches are scored after the share ``scored_part`` of the steps. The remaining steps use every patch. After
+    the last step, Gaussians are split at the edges of the views if the photos hardly suffer.
 
     Args:
         gaussians: The n Gaussians to start from.
@@ -60,7 +60,7 @@ def fit_full(
     if fixed is not None:
         fit.state.fixed[:] = fixed
     while fit.step < fit.steps:
-        if fit.progress >= run.half_part:  # before Gaussians are split, because new halves score worse
+        if fit.progress >= run.scored_part:  # before Gaussians are split, because new halves score worse
             score_fit(fit)
         renew_state(fit)
         take_step(fit)

@@ -12,7 +12,7 @@ from gsmerge.method.fit.outside import Outside
 from gsmerge.method.fit.photo_sizes import HIDDEN_WEIGHT, reduced, training_weights
 from gsmerge.method.kernels.elementary import power
 from gsmerge.method.raster.photos import WHOLE_PHOTO, Photos, Sample
-from gsmerge.settings.fit import LONG_STEPS, FitOptions, Tuning
+from gsmerge.settings.fit import LONG_STEPS, SAMPLED_STEPS, USUAL_HALF, FitOptions, Tuning
 from gsmerge.types import Region
 
 GROWTH = 0.5  # share of the steps after which Gaussians are added
@@ -102,6 +102,7 @@ class FitRun:
     step_weights: tuple[list[np.ndarray], ...]
     dropout: float  # Share of the Gaussians that a step leaves out
     half_part: float  # Share of the steps that are the first steps, which draw a quarter of the pixels
+    scored_part: float  # Share of the steps after which held-out patches are scored, and all pixels count
     samples: bool = True  # True if most of the first steps draw samples of photos; otherwise all draw half-size photos
     # [h,w] bool of each photo at full size: the pixels that count in the first steps, or None if the same pixels
     # count as in later steps
@@ -110,10 +111,10 @@ class FitRun:
     def weight(self, step: Step) -> np.ndarray:
         """Return the weights ``[h,w]`` of the pixels that a step draws.
 
-        In the first steps the weights are 0 on held-out patches.
+        Until the held-out patches are scored, the weights are 0 on them.
         """
         weight = self.step_weights[step.mode.size][step.view][step.sample.pixels]
-        if step.mode.stride == 1 or self.first_pixels is None:
+        if self.first_pixels is None or step.mode.stride == 1 or step.progress >= self.scored_part:
             return np.ascontiguousarray(weight)
         return np.where(self.first_pixels[step.view][step.sample.pixels], weight, np.float32(0))
 
@@ -166,8 +167,7 @@ def prepare_fit(job: FitJob) -> FitRun:
     # need at least as many pixels as there are Gaussians. Cameras that move need half-size photos, whose blur gives a
     # gradient even to a pose with an error of a pixel
     sample_pixels = num_photos * (photos[0].width // STRIDE) * (photos[0].height // STRIDE)
-    min_steps = 30  # shorter runs draw too few samples to see all pixels: they lose .07 dB at 20 steps, 1 dB at 7
-    can_sample = steps >= min_steps and not options.move_cameras and max(1, job.count) <= sample_pixels
+    can_sample = steps >= SAMPLED_STEPS and not options.move_cameras and max(1, job.count) <= sample_pixels
     full_weights, *large_weights = (_weigh(_weights_of(level), level) for level in (photos[0], *photos[2:]))
     score_weights = half_weights = _weights_of(photos[1])
     first_pixels = None
@@ -184,6 +184,7 @@ def prepare_fit(job: FitJob) -> FitRun:
         step_weights=(full_weights, _weigh(half_weights, photos[1]), *large_weights),
         dropout=dropout,
         half_part=options.half_res_part,
+        scored_part=min(options.half_res_part, USUAL_HALF),
         samples=can_sample,
         first_pixels=first_pixels,
     )

@@ -19,6 +19,7 @@ from gsmerge.method.fit.schedule import (
     DROPOUT,
     FEW_VIEWS,
     MANY_STEPS,
+    STRIDE,
     DrawMode,
     Schedule,
     Step,
@@ -425,6 +426,25 @@ def test_shorter_runs_have_more_steps_on_half_size_photos() -> None:
     parts = [FitOptions(fit_steps=steps).half_res_part for steps in (10, 60, GROW_STEPS, 1000)]
     assert 1 == parts[0] > parts[1] == parts[2] > parts[3]
     assert replace(LONGER, half_res_share=0.9).half_res_part == 0.9
+
+
+def test_short_runs_draw_samples_alone_unless_cameras_move_or_photos_are_larger() -> None:
+    planned = FitOptions(fit_steps=60, photo_scale=1.0)
+    assert planned.half_res_part == 1
+    assert replace(planned, fit_steps=GROW_STEPS).half_res_part < 1
+    assert replace(planned, move_cameras=True).half_res_part < 1
+    assert replace(planned, photo_scale=2.0).half_res_part < 1
+    assert replace(planned, half_res_share=0.5).half_res_part == 0.5
+
+
+def test_all_pixels_of_samples_count_once_the_held_out_patches_are_scored(photos: tuple[Photos, Photos]) -> None:
+    run = prepare_fit(FitJob(photos, FitOptions(fit_steps=60, photo_scale=1.0, holdout=0.2)))
+    schedule = Schedule(run)
+    steps = [schedule.draw(number + 1, number / 60, 1) for number in range(60)]
+    assert {step.mode.stride for step in steps} == {STRIDE}
+    is_whole = [bool((run.weight(step) == 1).all()) for step in steps]
+    assert is_whole == [step.progress >= run.scored_part for step in steps]
+    assert 0 < sum(is_whole) < 30
 
 
 def test_more_gaussians_have_fewer_steps_on_half_size_photos() -> None:
