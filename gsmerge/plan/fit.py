@@ -15,7 +15,6 @@ from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.fit import GROW_ROUNDS, GROW_STEPS, USUAL_SHARE, FitOptions
 
 AUTO_STEPS = 2  # with budget auto, steps relative to the usual number: few Gaussians need more steps
-SHORT_STEPS = 60  # a fit with at most this many steps still gains from a better start
 MOST_STEPS = 2.0  # most steps for more than the usual share of Gaussians per pixel, relative to the usual steps
 USUAL_VIEWS = 12  # views up to which the steps of an effort are enough
 NO_FIT = "without cameras a draft has no fit: --effort fast has one"

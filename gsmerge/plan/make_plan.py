@@ -31,12 +31,12 @@ from gsmerge.plan.counts import (
     resolve_budget,
 )
 from gsmerge.plan.efforts import EFFORTS
-from gsmerge.plan.fit import SHORT_STEPS, fit_to_pictures, resolve_fit
+from gsmerge.plan.fit import fit_to_pictures, resolve_fit
 from gsmerge.plan.networks import choose_networks, cuts_views, load_networks
 from gsmerge.runtime.record import note, stage
 from gsmerge.settings.budget import AUTO
 from gsmerge.settings.compact import COUNTS, OURS, CompactOptions
-from gsmerge.settings.fit import FitOptions
+from gsmerge.settings.fit import GROW_STEPS, FitOptions
 from gsmerge.settings.setting import flat_settings
 from gsmerge.settings.stages import SHARE, USUAL_K, DecodeOptions, MatchOptions, PrepareOptions, SegmentOptions
 from gsmerge.types import Scene
@@ -255,7 +255,7 @@ def resolve_decode(options: CompactOptions, scene: SceneSize) -> DecodeOptions:
         return replace(decode, k=USUAL_K)
     decides_count = options.budget.quality is not None or options.changed_counts
     steps = EFFORTS[options.effort].steps if options.fit.fit_steps is None else options.fit.fit_steps
-    has_long_fit = options.fit.fit != "none" and steps > SHORT_STEPS
+    has_long_fit = options.fit.fit != "none" and steps >= GROW_STEPS
     keeps_k = decides_count or options.replaces_stages or has_long_fit
     return replace(decode, k=USUAL_K if keeps_k else LONE_K)
 

@@ -9,10 +9,13 @@ from gsmerge.frozen import dataclass, replace
 from gsmerge.settings.setting import Settings, setting
 
 Fit = Literal["full", "none"]
-STEPS = 320  # default number of steps of the full fit
+STEPS = 330  # default number of steps of the full fit
 LONG_STEPS = 600  # runs with at least this many steps gain from a little dropout
 USUAL_SHARE = 0.044  # for this many Gaussians per pixel, a quarter of the pixels is enough in the first steps
-USUAL_HALF = 0.7  # usual share of the steps that draw a quarter of the pixels
+# Shares of the steps that draw a quarter of the pixels: of runs that draw samples of photos, and of others, which draw
+# half-size photos or, later, larger photos
+SAMPLED_HALF = 0.8
+USUAL_HALF = 0.7
 SAMPLED_STEPS = 30  # shorter runs draw too few samples to see all pixels: they lose .07 dB at 20 steps, 1 dB at 7
 GROW_STEPS = 150  # runs with fewer steps do better when they begin with all their Gaussians
 # A run grows only if it has at least this many steps for each photo, because each step draws one photo, and each photo
@@ -87,7 +90,7 @@ class FitOptions(Settings):
     fit: Fit = setting("full", "full: fit the Gaussians to the photos, which takes most of a run's time; none: skip "
         "it.")  # fmt: skip
     fit_steps: int | None = setting(None, "Number of steps of the full fit; each step draws one view.",
-        "By default 320, scaled by `effort` and by the numbers of views and Gaussians.", least=1)  # fmt: skip
+        "By default 330, scaled by `effort` and by the numbers of views and Gaussians.", least=1)  # fmt: skip
     photo_scale: float | Literal["auto"] = setting("auto", "Size of the photos in two of every five later steps, "
         "relative to the views; at most the size of the photo files.",
         "`auto`: up to 2 with effort `default` and `best`.", least=1, below=math.inf)  # fmt: skip
@@ -95,8 +98,8 @@ class FitOptions(Settings):
         "By default 0.1 for at most five views and at least 150 steps, 0.05 for at least 600 steps and 30 steps per "
         "view, otherwise 0.", least=0, below=1)  # fmt: skip
     half_res_share: float | None = setting(None, "Share of the steps, at the start of a run, that draw a quarter of "
-        "the pixels.", "By default 0.7, with at least 600 steps 0.5. With fewer than 150 steps 1, unless cameras move "
-        "or photos are larger. Less if there are more Gaussians than 4.4 % of the pixels.",
+        "the pixels.", "By default 0.8, with at least 600 steps 0.5, with 30 to 149 steps 1; if cameras move, "
+        "photos are larger or steps fewer, 0.7. Less if there are more Gaussians than 4.4 % of the pixels.",
         least=0, most=1)  # fmt: skip
     holdout: float = setting(0.05, "Share of the photos' patches that is held out, to decide whether a fit is "
         "accepted.", above=0, below=1)  # fmt: skip
@@ -129,14 +132,15 @@ class FitOptions(Settings):
         if self.half_res_share is not None:
             return self.half_res_share
         too_few_steps = 20  # runs with fewer steps are too short to draw whole photos
-        # Short runs learn more from many samples than from few whole photos. Larger photos and photos of cameras that
-        # move cannot be sampled
-        is_sampled = SAMPLED_STEPS <= self.steps < GROW_STEPS and self.photo_scale == 1 and not self.move_cameras
+        can_sample = self.steps >= SAMPLED_STEPS and not self.move_cameras
+        # short runs learn more from many samples than from few whole photos
+        is_sampled = can_sample and self.steps < GROW_STEPS and self.photo_scale == 1
         if is_sampled or self.steps < too_few_steps:
             return 1.0
+        usual = SAMPLED_HALF if can_sample and self.photo_scale in ("auto", 1) else USUAL_HALF
         most = 0.5 if self.steps >= LONG_STEPS else 1.0  # long runs have time for details, which need whole photos
         density = 1.0 if self.share is None or not self.grows else self.share / USUAL_SHARE
-        return min(most, USUAL_HALF / math.sqrt(max(density, 1.0)))  # more Gaussians show more details
+        return min(most, usual / math.sqrt(max(density, 1.0)))  # more Gaussians show more details
 
     @property
     def grows(self) -> bool:

@@ -12,7 +12,7 @@ from gsmerge.method.fit.outside import Outside
 from gsmerge.method.fit.photo_sizes import HIDDEN_WEIGHT, reduced, training_weights
 from gsmerge.method.kernels.elementary import power
 from gsmerge.method.raster.photos import WHOLE_PHOTO, Photos, Sample
-from gsmerge.settings.fit import LONG_STEPS, SAMPLED_STEPS, USUAL_HALF, FitOptions, Tuning
+from gsmerge.settings.fit import LONG_STEPS, SAMPLED_STEPS, FitOptions, Tuning
 from gsmerge.types import Region
 
 GROWTH = 0.5  # share of the steps after which Gaussians are added
@@ -21,6 +21,7 @@ GROWTH = 0.5  # share of the steps after which Gaussians are added
 # comes shortly before the steps over which parameters are averaged
 CUTS = (0.0, 0.15, 0.3, 0.5, 0.7)
 CLEARS = (0.6, 0.7, 0.8)  # shares of the steps after which a run that grows drops its faint Gaussians
+SCORED = 0.7  # largest share of the steps after which held-out patches are scored; later samples draw them, too
 FEW_VIEWS = 5  # with no more views, a run of MANY_STEPS or more memorises the photos, unless it has a dropout
 MANY_STEPS = 150
 # Most of the first steps draw a sample of a photo's pixels, each time a different sample: every STRIDE-th pixel in both
@@ -184,7 +185,7 @@ def prepare_fit(job: FitJob) -> FitRun:
         step_weights=(full_weights, _weigh(half_weights, photos[1]), *large_weights),
         dropout=dropout,
         half_part=options.half_res_part,
-        scored_part=min(options.half_res_part, USUAL_HALF),
+        scored_part=min(options.half_res_part, SCORED),
         samples=can_sample,
         first_pixels=first_pixels,
     )
