@@ -19,6 +19,7 @@ _START = 1 << 10  # number of first bytes of a file that are compared with patte
 _REPORTS = b'content="gsmerge ', b'"name": "gsmerge"', b"schema_version,result,"
 _DOWNLOAD = "download it again, in a browser if the page needs a click or a login"
 _UNPACK = "unpack it, and name the scene in it"
+_NAME_SUBJECT = "name the scene or the result that it is about"
 _COPY_AGAIN = "copy or download it again"
 
 
@@ -103,6 +104,12 @@ OTHER_CONTENTS = (
     OtherContent("a 7z archive", r"7z\xbc\xaf\x27\x1c", _UNPACK),
     OtherContent("a rar archive", r"Rar!\x1a\x07", _UNPACK),
     OtherContent("a packed file", r"BZh[1-9]1AY|\xfd7zXZ\0|\x28\xb5\x2f\xfd", _UNPACK),
+    OtherContent(
+        "a report of gsmerge, which no command reads",
+        r'\s*\{\s*"schema_version":\s*\d+,\s*"tool":\s*\{\s*"name":\s*"gsmerge"|schema_version,result,',
+        _NAME_SUBJECT,
+        allowed=(".jsonl",),  # to which a batch adds
+    ),
     OtherContent("a PLY file", r"ply\r?\n", "change its ending to .ply", refused=_PACKED_SCENES),
     OtherContent(
         "text", r"(?!ply[\r\n])\s*(?P<quote>[ -~\x80-\xff]+)(?:[\t\r\n][\t\r\n -~\x80-\xff]*)?\Z", _DOWNLOAD,
@@ -155,5 +162,6 @@ def check_first_bytes(path: Path, size: int) -> None:
             quote = (match.groupdict().get("quote") or b"").decode("utf-8", "replace").strip()
             shown = f" ({' '.join(quote.split())!r:.60})" if quote else ""
             # An archive may have a scene inside
-            expected = "scene" if row.remedy == _UNPACK else f"{ending} file".strip()
+            scenes = {_UNPACK: "scene", _NAME_SUBJECT: "scene or cameras"}
+            expected = scenes.get(row.remedy, f"{ending} file".strip())
             raise SceneError(path, f"expected a {expected}, found {row.what}{shown}", row.remedy)

@@ -15,6 +15,7 @@ from gsmerge.io.formats import ply, streamed
 from gsmerge.io.formats.read_gaussians import degree_notes, read_gaussians
 from gsmerge.io.formats.table import HTML, READ_ENDINGS, SCENE_SUFFIXES, STATE, STATE_ENDING, may_hold_gaussians
 from gsmerge.io.image_names import IMAGE_SUFFIXES, OTHER_SUFFIXES
+from gsmerge.jobs.batch.records import RECORDS
 from gsmerge.jobs.states.state_file import holds_features, load_state
 from gsmerge.reading.checkpoint import load_checkpoint
 from gsmerge.reading.exporters import NO_HINTS
@@ -103,6 +104,9 @@ def _read_other(path: Path) -> FileCheck:
         cameras = read_cameras(path)
         return FileCheck(str(path), "cameras", len(cameras), cameras.source)
     check_file(path)
+    if path.name == RECORDS:
+        problem = "expected a scene, found the records of a batch"
+        raise SceneError(path, problem, "gsmerge batch continues from them; name a result of it")
     if suffix in SCENE_SUFFIXES:
         find_scene_files(path)  # raises an error that says what a file without Gaussians holds
     if suffix == HTML.ending:

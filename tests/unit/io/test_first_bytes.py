@@ -16,6 +16,10 @@ from gsmerge.errors import SceneError
 from gsmerge.io import read_gaussians
 from gsmerge.io.bounds import check_file
 from gsmerge.io.first_bytes import NO_TEXT
+from gsmerge.io.jsonl import append_line
+from gsmerge.jobs.batch.records import RECORDS, record
+from gsmerge.jobs.file_checks import check_content
+from gsmerge.runtime.documents import document_head, to_json
 
 ZIP, _ = OTHER_CONTENT["a zip"]
 GLTF = {"a glTF": (b'{"asset": {"version": "2.0"}}', ("glTF", ".glb"))}
@@ -38,6 +42,16 @@ def test_other_content_in_the_place_of_a_photo_is_named(content: bytes, found: s
     (tmp_path / "a.JPG").write_bytes(content)
     with refuses(SceneError, "a.JPG", found):
         check_file(tmp_path / "a.JPG")
+
+
+def test_reports_of_gsmerge_are_named(tmp_path: Path) -> None:
+    for name, content in (("a.json", to_json(document_head())), ("a.csv", "schema_version,result,psnr\n")):
+        (tmp_path / name).write_text(content)
+        assert "a report of gsmerge" in check_content(tmp_path / name).problems[0]
+    records = tmp_path / RECORDS
+    append_line(records, record("done", "a.ply", "b.ply"))
+    check_file(records)  # a batch reads it, but it is no scene
+    assert "gsmerge batch" in check_content(records).problems[0]
 
 
 @pytest.mark.parametrize(
