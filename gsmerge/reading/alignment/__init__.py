@@ -18,4 +18,4 @@ from gsmerge.reading.alignment.dropped_rows import estimate_cameras
 from gsmerge.reading.alignment.explain import explain_misalignment, misalignment_error
 from gsmerge.reading.alignment.layouts import ESTIMATED, TRIMS, Layout
 from gsmerge.reading.alignment.score import Alignment, check_pairs, check_pixels, sample_pixels
-from gsmerge.reading.alignment.unaligned import CameraCheck, UnseenError, check_cameras, choose_poses
+from gsmerge.reading.alignment.unaligned import CROPPED, CameraCheck, UnseenError, check_cameras, choose_poses

@@ -71,6 +71,7 @@ _SHIFT_STEPS = [(2000 if i < 5 else 20_000, 8 if i < 5 else 1, 0.05 * 0.6**i) fo
 
 
 MIRRORED = "photos that show the Gaussians as in a mirror"
+CROPPED = "if the photos were cropped after the model saw them, name the whole photos, or cameras of crops (--cameras)"
 UNMIRROR = "export the Gaussians without the flip of an axis; no option of gsmerge mirrors a scene"
 
 
@@ -264,8 +265,8 @@ def choose_cameras(
         remedy = f"{no_pixels.remedy}, or write their shift (x y z) to offset.txt beside the file"
         remedy += f", or copy nerfstudio's dataparser_transforms.json to {Path(no_pixels.path).parent}"
         if check.share_seen > 0.5:  # the views see most Gaussians, so only the colours contradict the cameras
-            remedy += "; if the cameras are right, the photos or the colours of the file are wrong: --images none keeps"
-            remedy += " the cameras, and --hint colors=rgb reads f_dc as RGB"
+            remedy += f"; {CROPPED}; if the cameras are right, the photos or the colours of the file are wrong:"
+            remedy += " --images none keeps the cameras, and --hint colors=rgb reads f_dc as RGB"
         unseen = UnseenError(no_pixels.path, f"{no_pixels.problem}; {check.description}", remedy)
         unseen.sight = check
         raise unseen
@@ -301,6 +302,7 @@ def _check_colors(inputs: AlignmentInput, cameras: Cameras, name: str, no_pixels
             " photos as from random pixels"
         )
         remedy = "name the exporter with --hint exporter, export all pixels, or give cameras in the file's frame"
+        remedy += f"; {CROPPED}"
         raise SceneError(no_pixels.path, f"{no_pixels.problem}; {measured}", remedy)
 
 

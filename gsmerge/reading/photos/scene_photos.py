@@ -50,7 +50,7 @@ from gsmerge.method.compare.offsets import OFFSET_PIXELS, correlate_parts
 from gsmerge.method.compare.view_pictures import ViewPictures, show_views
 from gsmerge.method.kernels.pictures import turn_picture
 from gsmerge.method.raster.photos import row_pictures
-from gsmerge.reading.alignment import ESTIMATED
+from gsmerge.reading.alignment import CROPPED, ESTIMATED
 from gsmerge.reading.photos.grid_fit import WHOLE_FIT, GridFit, PartFit, choose_fit, list_fits
 from gsmerge.reading.scene_files import SceneFiles, list_folders
 from gsmerge.runtime.record import list_faults, list_some
@@ -567,18 +567,16 @@ def explain_mismatch(photos: ScenePhotos, camera_file: CameraFile) -> MismatchEr
     """Return the error that no photo shows any view, with the names of the photos that cannot be used."""
     views = f"the {len(camera_file)} views of {camera_file.widths[0]} x {camera_file.heights[0]} pixels"
     found = "none that shows one of them"
-    remedy = "name their folder with --images"
     if not any(photos.named):  # neither names nor order propose a file
         photos = replace(photos, named=photos.pool)
     if has_other_shape(photos, camera_file) and camera_file.source != ESTIMATED:
         width, height = image_size(next(filter(None, photos.named)))
         shape = " (2 : 1 as 360-degree panoramas have)" if width == 2 * height else ""
         found = f"{width} x {height}{shape}, of which no part shows one of them"
-        remedy = f"if they were cropped after the model saw them, name the photos that it saw; or {remedy}"
     faults = [fault for fault in photos.faults if fault is not None]
     reasons = f" ({list_faults(faults)})" if faults else ""
     problem = f"expected photos of {views}, found {found}{reasons}"
-    return MismatchError(photos.folder, problem, remedy)
+    return MismatchError(photos.folder, problem, f"name their folder with --images; {CROPPED}")
 
 
 def without_photo(scene: Scene, views: Sequence[int]) -> Scene:

@@ -423,14 +423,16 @@ def test_cameras_of_world_mirror_are_scaled_to_the_photos(
     assert np.allclose(cameras.Ks, K * np.array([[times], [times], [1]]))
 
 
-def test_photos_that_were_cropped_later_are_refused_with_the_cause(tmp_path: Path) -> None:
-    """Names and order propose none of them, and their shape is not that of the views."""
+@pytest.mark.parametrize("width", [48, 96])  # of another shape than the views, and of theirs but not about the middle
+def test_photos_that_were_cropped_later_are_refused_with_the_cause(tmp_path: Path, width: int) -> None:
+    """Names and order propose none of them, and they do not show the views."""
     tiny = smooth_scene(96, 72)
     save_export(tmp_path / "gs_ply", tiny, export_rows(tiny), cameras=False, name="0000.ply")
     write_npz(tmp_path / "exports/npz/results.npz", tiny, depth=tiny.depths.astype(np.float32))
     for view in range(4):  # one more than there are views
-        noise = np.random.default_rng(view).integers(0, 256, (72, 48, 3), np.uint8)
+        noise = np.random.default_rng(view).integers(0, 256, (72, width, 3), np.uint8)
         (tmp_path / "cut").mkdir(exist_ok=True)
         cv2.imwrite(str(tmp_path / f"cut/shot_{view}.png"), noise)
-    with refuses(SceneError, tmp_path / "cut", "96 x 72", "48 x 72", "cropped", "--images"):
+    sizes = ["96 x 72"] if width == 96 else ["96 x 72", f"{width} x 72"]
+    with refuses(SceneError, tmp_path / "cut", *sizes, "cropped", "--images", "--cameras"):
         load_scene(tmp_path, images=tmp_path / "cut")
