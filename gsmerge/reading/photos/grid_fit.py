@@ -50,13 +50,12 @@ class PartFit:
         photo_text = "{} x {}".format(*size)
         part = part_size(size, self.part)
         part_text = "{} x {}".format(*part)
-        ratio = self.stretch(part)[0] * part[1] / (part[0] * self.stretch(part)[1])
         if bars:
             return f"bars around the photos are cut off: {photo_text} pixels become {part_text}"
         corner = f" from column {round(size[0] * self.part[0])} and line {round(size[1] * self.part[1])} on"
-        stretched = f", stretched to {max(ratio, 1 / ratio):.2f} times their {'width' if ratio > 1 else 'height'}"
+        stretched = ", stretched to {} x {}".format(*self.stretch(part)) if self.shape else ""
         part_name = "photos" if self.part == WHOLE else f"the {part_text} pixels{corner} of photos"
-        used = f"{part_name} of {photo_text} are used{stretched if self.shape else ''}"
+        used = f"{part_name} of {photo_text} are used{stretched}"
         return f"{used}, since they fit the Gaussians best"
 
 

@@ -40,9 +40,9 @@ CASES: dict[str, tuple[Change, tuple[object, ...]]] = {
     "bars": (lambda i: np.pad(i, ((9, 9), (12, 12), (0, 0))), ("bars", "72 x 54", "48 x 36")),
     "both eyes squeezed": (
         lambda i: cv2.resize(np.hstack([i, other(i)]), (48, 36), interpolation=cv2.INTER_AREA),
-        ("24 x 36", "2.00"),
+        ("24 x 36", "48 x 36"),
     ),
-    "squeezed": (lambda i: cv2.resize(i, (36, 36), interpolation=cv2.INTER_AREA), ("36 x 36", "1.33", "width")),
+    "squeezed": (lambda i: cv2.resize(i, (36, 36), interpolation=cv2.INTER_AREA), ("36 x 36", "48 x 36")),
 }
 
 
