@@ -102,7 +102,7 @@ def estimate(scene: Scene, options: CompactOptions) -> dict[str, Any]:
         ``num_gaussians`` is the largest number of Gaussians that the result can have or, if ``exact``, the number that
         it will have. If ``psnr_kept`` is a number, ``num_gaussians`` is the smallest number, and the run takes
         more Gaussians, up to ``most_gaussians``, until the PSNR against the input is ``psnr_kept`` dB. If
-        ``loss_kept`` is a number, the run takes more Gaussians until the result shows the photos at most
+        ``loss_kept`` is a number, the run takes more Gaussians only if otherwise the result shows the photos more than
         ``loss_kept`` dB worse than the input. If ``quality`` is given, the run takes more or fewer Gaussians
         until this quality is met. ``ratio`` is ``num_gaussians`` relative to the input, and ``bytes`` is the
         size as a ``.ply``. ``superpixels_per_view`` is None if a budget distributes superpixels among the
@@ -189,7 +189,7 @@ def estimate_lines(run: Mapping[str, Any]) -> list[str]:
     if run["quality"] is not None:
         number = f"{count}, or more or fewer until --quality {run['quality']} is met"
     if run["loss_kept"] is not None:
-        number = f"{count}, or more until the photos are shown within {run['loss_kept']:g} dB of the input"
+        number = f"at most {count}, unless photos need more to be within {run['loss_kept']:g} dB of the input"
     return [
         f"compact    {number},"
         f" {human_bytes(run['bytes'])} as .ply, in about {run['seconds']:g} s with {run['memory_bytes'] / 1e9:g} GB of"
