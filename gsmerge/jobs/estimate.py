@@ -181,7 +181,7 @@ def estimate_lines(run: Mapping[str, Any]) -> list[str]:
     method = f"{superpixels}; merging across views: {run['match']}; networks: {run['checkpoint']}"
     if per_view == 0:
         method = "neighbours merged pair by pair, because no photo shows them"
-    count = f"{run['num_gaussians']:,} Gaussians ({100 * run['ratio']:.1f} %)"
+    count = f"{run['num_gaussians']:,} Gaussians ({100 * run['ratio']:.1f} % of the input)"
     number = count if run["exact"] else f"at most {count}"
     if run["psnr_kept"] is not None:
         bound = f"at most {run['most_gaussians']:,} Gaussians; the run chooses the number"
