@@ -124,6 +124,9 @@ class Doubt(Note):
     """
 
 
+USUAL = "usual"  # topic of notes on what is changed in most scenes
+
+
 def list_doubts(notes: Iterable[str]) -> list[str]:
     """Return the notes that are doubts."""
     return [note for note in notes if isinstance(note, Doubt)]

@@ -1,6 +1,7 @@
 """``gsmerge batch``: many scenes, each on its own."""
 
 import json
+import re
 import sys
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from gsmerge.cli import parameters as opt
 from gsmerge.cli.console import RunEnd, print_document, say, separate_stdout, terminal_columns, total_progress
-from gsmerge.errors import BatchError, Doubt, TargetError, UsageError, count_words
+from gsmerge.errors import USUAL, BatchError, Doubt, TargetError, UsageError, count_words, split_notes
 from gsmerge.settings.budget import AUTO
 from gsmerge.settings.compact import CompactOptions
 from gsmerge.settings.setting import Setting
@@ -26,8 +27,8 @@ TABLE_HEADER = ("result", "Gaussians", "of", "kept", "new views", "own before", 
 OMITTED_FIRST = ("of", "seconds", "own before", "own after", "kept")  # columns that a narrow terminal omits, in order
 # Kind of a reason -> word that begins its line, and noun for counting the lines that are not listed
 REASONS = {
-    "doubt": ("warning", "warning"), "unmet": ("missed target", "missed target"), "lacking": ("note", "note"),
-    "error": ("failed", "failure"),
+    "change": ("changed", "change"), "doubt": ("warning", "warning"), "unmet": ("missed target", "missed target"),
+    "lacking": ("note", "note"), "error": ("failed", "failure"),
 }  # fmt: skip
 
 
@@ -144,9 +145,10 @@ def _run(
                 {}, [*totals.lines(terminal_columns(sys.stdout)), *map("note: {}".format, notes)], as_json=False
             )
     doubtful = totals.reasons["doubt"]
+    num_doubtful = len({scene for scene, _ in doubtful})
     results = count_words(totals.total - len(totals.reasons["error"]), "result")
     problem = (
-        f"{len(doubtful)} of {results} {'is' if len(doubtful) == 1 else 'are'} doubtful"
+        f"{num_doubtful} of {results} {'is' if num_doubtful == 1 else 'are'} doubtful"
         f"{_first_reason(doubtful, listed=not silent)}"
     )
     if doubtful and not strict:
@@ -193,7 +195,10 @@ class Totals:
         from gsmerge.runtime.memory import human_share
 
         report = record["report"]
-        reasons = {"doubt": "; also ".join(record["doubts"]), "unmet": record["unmet"], "error": record["error"]}
+        reasons = [("unmet", record["unmet"]), ("error", record["error"])]
+        reasons += [("doubt", doubt) for doubt in record["doubts"]]
+        changes = report["choices"].get("changes", ()) if report else ()
+        reasons += [("change", change) for change in split_notes(changes, USUAL)[1]]
         if report and not report["input"]["num_photos"] and {*record["doubts"]} <= {report["worse"]}:
             if report["input"]["num_views"]:
                 own = report.get("psnr_reference") == ROW_COLORS
@@ -202,8 +207,8 @@ class Totals:
             else:
                 place = "no cameras found beside it or in the named folder"
                 lack = f"{place}; name them with --cameras, and photos with --images"
-            reasons["lacking"] = lack
-        for kind, reason in reasons.items():
+            reasons.append(("lacking", lack))
+        for kind, reason in reasons:
             if reason:
                 self.reasons[kind].append((record["scene"], reason))
         self.counts[record["status"]] += 1
@@ -237,6 +242,7 @@ class Totals:
         from gsmerge.jobs.batch.records import DONE, FAILED, SKIPPED
         from gsmerge.runtime.documents import text_table
         from gsmerge.runtime.memory import human_share
+        from gsmerge.runtime.record import list_some
 
         rows = [TABLE_HEADER, *sorted(self.rows, key=lambda row: natural_key(row[0]))]
         lines = (
@@ -246,14 +252,18 @@ class Totals:
         )
         lines += [f"... and {self.counts[DONE] - len(self.rows):,} more"] * (self.counts[DONE] > len(self.rows))
         for name, (word, noun) in REASONS.items():
-            scenes_by_reason: dict[str, list[str]] = {}
+            alike: dict[str, dict[str, str]] = {}  # kind -> scene -> reason
             for scene, reason in self.reasons[name]:
-                scenes_by_reason.setdefault(reason, []).append(scene)
+                # changes of one kind differ in their numbers
+                kind = re.sub(r"\d[\d.,]*\d|\d", "...", reason) if name == "change" else reason
+                alike.setdefault(kind, {})[scene] = reason
             grouped = []
-            for reason, (first, *more) in scenes_by_reason.items():
-                others = f" and {count_words(len(more), 'other')}" if more else ""
+            for kind, reason_of in alike.items():
+                first, *others = dict.fromkeys(reason_of.values())
                 # A reason that begins with the scene's name is a line by itself
-                grouped.append(reason if reason.startswith(first) else f"{first}{others}: {reason}")
+                is_named = first.startswith(next(iter(reason_of)))
+                scenes = list_some(sorted(reason_of, key=natural_key))
+                grouped.append(first if is_named else f"{scenes}: {kind if others else first}")
             lines += [f"{word}: {line}" for line in grouped[:MAX_LISTED]]
             lines += [f"... and {count_words(len(grouped) - MAX_LISTED, f'more {noun}')}"] * (len(grouped) > MAX_LISTED)
         counts = {status: self.counts[status] for status in (DONE, SKIPPED, FAILED)}
@@ -264,7 +274,8 @@ class Totals:
             share = human_share(self.counts["out"] / num_input)
             total_line += f"; {num_input:,} -> {self.counts['out']:,} Gaussians ({share})"
         for name, words in (("unmet", "missed the target"), ("doubt", "doubtful")):
-            total_line += f"; {len(self.reasons[name]):,} {words}" if self.reasons[name] else ""
+            count = len({scene for scene, _ in self.reasons[name]})
+            total_line += f"; {count:,} {words}" if count else ""
         return [*lines, total_line]
 
 

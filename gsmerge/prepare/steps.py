@@ -12,7 +12,7 @@ from typing import cast
 import numpy as np
 
 from gsmerge.arrays import max_columns
-from gsmerge.errors import count_words
+from gsmerge.errors import USUAL, Note, count_words
 from gsmerge.frozen import dataclass, replace
 from gsmerge.method.facts.pictures import PHOTOS, RENDERS, ROW_COLORS
 from gsmerge.method.facts.prepared import Prepared, Reference, with_photos
@@ -267,6 +267,7 @@ def fill_scene(p: Prepared, options: PrepareOptions) -> Prepared:
         added += f"; {list_some(few)} had fewer than half as many Gaussians as views usually have"
     elif count and not p.scene.get_pixels().shown[:, [0, -1]].any():
         added += ", which is usual: the model left the borders of its pictures out, and perhaps the sky"
+        added = Note(added, USUAL)
     drawn = ""
     if scene.images is not p.scene.images:
         is_drawn = np.stack([max_columns(a != b) for a, b in zip(p.scene.images, scene.images, strict=True)])

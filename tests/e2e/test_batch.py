@@ -16,6 +16,7 @@ from shared import make_once, write_scene
 import gsmerge
 from gsmerge.cli import main
 from gsmerge.cli.batch_command import Totals
+from gsmerge.errors import USUAL, Note
 from gsmerge.jobs.batch.records import record
 
 from .conftest import Outcome, Run, listing
@@ -164,6 +165,25 @@ def test_the_table_at_the_end_has_the_first_results() -> None:
     counts = "1,000 scenes: 300 done, 301 skipped, 300 failed, 99 left; 30,000 -> 1,200 Gaussians (4.00 %)"
     assert last == f"{counts}; 1 missed the target"
     assert Totals(0).lines() == ["0 scenes: 0 done"]
+
+
+def test_each_kind_of_change_and_each_warning_is_printed_once() -> None:
+    totals = Totals(6)
+    for number in range(6):
+        changes = [Note("borders filled", USUAL), f"{number} photos mended", *["sky left out"] * (number == 0)]
+        report = REPORT | {"choices": {"changes": changes}}
+        doubts = ["too dark", *["too small"] * (number == 1)]
+        totals.add(record("done", f"s{5 - number}", f"{number}.ply", doubts=doubts, report=report))
+    lines = totals.lines()
+    assert [line for line in lines if line.startswith("changed: ")] == [
+        "changed: s0, s1, s2, s3 and 2 more: ... photos mended",
+        "changed: s5: sky left out",
+    ]
+    assert [line for line in lines if line.startswith("warning: ")] == [
+        "warning: s0, s1, s2, s3 and 2 more: too dark",
+        "warning: s4: too small",
+    ]
+    assert lines[-1].endswith("; 6 doubtful")
 
 
 def test_folders_without_gaussians_are_noted_by_name(rooms: Path, tmp_path: Path, run: Run) -> None:
