@@ -253,7 +253,7 @@ def result_table(document: Mapping[str, Any], next_step: str | None = None, *, c
         on_files = None  # both numbers are printed equal to the PSNR on the changed photos
     scores = {
         "all of them" if choices.get("scored_all") else "by a sample": None if None in psnr.values() else psnr,
-        "on the {:.0f} % that the input covers": document["psnr_covered"],
+        "on the {:.0f} % that have Gaussians": document["psnr_covered"],
         "on its photos as their files have them": on_files,
         "on the {:.1f} % that are protected": document.get("psnr_protected"),
     }

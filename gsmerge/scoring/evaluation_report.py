@@ -152,7 +152,7 @@ def _quality_tables(document: Mapping[str, Any], split: str) -> Iterator[TextTab
     yield f"{views}, {seen}", ("", *SCORE_COLUMNS.values()), [(name, *_format_figures(mean)) for name, mean in means]
     input_mean = next(iter(results[0]["mean"].values()))  # over the input views, if they are measured
     lacks_pixels = (input_mean["share" + COVERED_SUFFIX] or 1) < WHOLE_SHARE
-    heading = f"{views}, over the pixels that the input covers"
+    heading = f"{views}, over the pixels that have Gaussians of the input"
     yield heading, ("", "of all", *(SCORE_COLUMNS[name] for name in SIMPLE)), [
         (name, f"{100 * mean['share' + COVERED_SUFFIX]:.0f} %", *_format_figures(mean, SIMPLE, COVERED_SUFFIX))
         for name, mean in (means if lacks_pixels else [])

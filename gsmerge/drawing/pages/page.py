@@ -185,7 +185,7 @@ def list_figures(data: ViewData, side_id: int) -> list[Figure]:
     names = ("psnr",) if is_expected else ("psnr", "ssim")  # the expected gain takes the room of the SSIM
     qualities = [(f"{name.upper()}, {views}", name, before.mean, after.mean) for name in names]
     if data.lacks_pixels:
-        label = f"PSNR on the {100 * (before.covered_share or 0):.0f} % that the input covers"
+        label = f"PSNR on the {100 * (before.covered_share or 0):.0f} % that have Gaussians"
         qualities.append((label, "psnr", before.covered, after.covered))
     scores = []
     for label, name, old_quality, new_quality in qualities:
