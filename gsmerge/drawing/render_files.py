@@ -31,7 +31,7 @@ from gsmerge.drawing.preview import (
     view_pictures,
 )
 from gsmerge.drawing.render_views import doubt_empty, near_plane
-from gsmerge.errors import SceneError, UsageError, name_notes
+from gsmerge.errors import SceneError, UsageError, name_notes, split_notes
 from gsmerge.frozen import dataclass, replace
 from gsmerge.io import file_notes, read_cameras, read_gaussians, to_cameras
 from gsmerge.io.atomic import atomic_outputs, common_mode
@@ -46,6 +46,7 @@ from gsmerge.method.viewpoints.place_cameras import add_views
 from gsmerge.prepare.prepare_scene import scored_pictures
 from gsmerge.reading.exporters import NO_HINTS, ReadHints
 from gsmerge.reading.held_out import read_into_frame
+from gsmerge.reading.photos.scene_photos import LEFT_OUT
 from gsmerge.reading.read_scene import Loaded, move_cameras_to_scene, read_gaussian_file
 from gsmerge.reading.scene_files import SceneFiles, find_scene_files
 from gsmerge.runtime.memory import human_bytes
@@ -346,6 +347,8 @@ def _read_scenes(options: DrawOptions, *, photos: bool) -> DrawnScenes:
         scene = scene if photos else subset(scene, range(len(scene) // 2))  # the other views are inside the scene
         scene = replace(scene, cameras=fill_cameras(scene.cameras, *PLACED_SIZE))
         load = replace(load, scene=scene, notes=(*load.notes, *record.notes))
+    if not photos:  # what is wrong with them does not matter
+        load = replace(load, notes=tuple(split_notes(load.notes, LEFT_OUT)[1]))
     scenes = [load.scene.file_gaussians if same_file else first_ply.gaussians, *(ply.gaussians for ply in plys)]
     notes = [[*([] if same_file else file_notes(first_ply.info)), *load.notes], *(file_notes(ply.info) for ply in plys)]
     notes_with_paths = [note for path, texts in zip(paths, notes, strict=True) for note in name_notes(path, texts)]

@@ -306,4 +306,4 @@ def leave_out(evidence: Evidence, files: SceneFiles, left_out: Sequence[str], ca
     remedy = cause.remedy or f"pass --{option} {value}, or --{option} {NONE}"
     verb = "is" if names == [str(files.cameras)] else "are"
     doubt = f"{' and '.join(names)} {verb} left out: {damaged_file}{cause.problem}; {remedy}"
-    return replace(evidence, notes=(Doubt(" ".join(doubt.split())), *notes))
+    return replace(evidence, notes=(Doubt(" ".join(doubt.split()), option), *notes))

@@ -105,6 +105,14 @@ def test_a_clip_is_an_orbit_by_default(small_scene: Path, tmp_path: Path, run: R
 
 
 @pytest.mark.slow
+def test_only_pictures_with_photos_tell_what_photos_lack(small_copy: Path, tmp_path: Path, run: Run) -> None:
+    next((small_copy / "images").iterdir()).unlink()
+    for name, is_told in (("frames", False), ("panel.png", True)):
+        words = ("--path", "orbit", "--frames", 2) if name == "frames" else ()
+        said = run("render", small_copy, *words, "-o", tmp_path / name, code=0).err
+        assert ("warning: photos of 1 of" in said) == is_told
+
+
 def test_path_of_a_file_is_placed_as_held_out_views_are(scene_copy: Path, tmp_path: Path, run: Run) -> None:
     """The cameras of the scene, and those of the path in their world, are in larger units than the Gaussians."""
     targets = tmp_path / "targets"

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from gsmerge.errors import Doubt, SceneError, attempt
+from gsmerge.errors import Doubt, Note, SceneError, attempt
 from gsmerge.frozen import dataclass, field, replace
 from gsmerge.io.cameras.camera_file import CameraFile, select_views, sizes_of
 from gsmerge.io.cameras.programs import SHARP
@@ -57,6 +57,7 @@ from gsmerge.runtime.record import list_faults, list_some
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Scene
 
+LEFT_OUT = "images"  # topic of notes on photos that are left out, which is the option that names others
 UNNAMED = "view 0"  # name of the first camera if its file has no names, or if cameras were estimated from rows
 _CHANNEL_ROUNDING = 1 / 255  # mean difference of channels that rounding to 8 bits may cause
 _MODEL_FOLDERS = {"sparse", "colmap", "distorted"}  # names of folders that have COLMAP's models
@@ -523,9 +524,9 @@ def describe_assignment(photos: ScenePhotos, camera_file: CameraFile, *, are_pix
     stems = {path.stem for path in (*photos.paths, *photos.named) if path is not None}
     spare = [path for path in photos.pool if str(path.parent) in folders and path.stem not in stems]
     if spare and not (are_pixels and (not photos.exact or len(spare) >= len(used))):
-        text = f"{len(spare)} of {len(spare) + len(used)} photos {'has' if len(spare) == 1 else 'have'} no camera"
         names = list_some([_short_path(path, photos) for path in spare])
-        notes.append(f"{text} and {'is' if len(spare) == 1 else 'are'} not used: {names}")
+        total = len(spare) + len(used)
+        notes.append(Note(f"no camera belongs to {len(spare)} of {total} photos, so not used: {names}", LEFT_OUT))
     faults = list[str]()
     for view in photos.absent:
         path = photos.named[view]
@@ -536,7 +537,7 @@ def describe_assignment(photos: ScenePhotos, camera_file: CameraFile, *, are_pix
         faults.append(photos.faults[view] or shown)
     if not faults:
         return notes
-    return [*notes, Doubt(f"photos of {len(faults)} of {count} views are left out: {list_faults(faults)}")]
+    return [*notes, Doubt(f"photos of {len(faults)} of {count} views are left out: {list_faults(faults)}", LEFT_OUT)]
 
 
 def describe_missing(names: Sequence[str], stored: CameraFile | None, *, is_right: bool) -> str | None:
