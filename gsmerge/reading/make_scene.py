@@ -16,6 +16,7 @@ from gsmerge.io.formats.read_gaussians import GaussianFile, file_notes
 from gsmerge.io.formats.rows import MAX_STRAY, RESULT_COMMENT
 from gsmerge.io.photo_files import NO_IMAGES, as_floats, photo_size
 from gsmerge.method.geometry.transforms import move_views
+from gsmerge.method.raster.photos import WHOLE_SHARE
 from gsmerge.reading.alignment import AlignmentResult, check_pixels, find_pixels
 from gsmerge.reading.choice import make_choice
 from gsmerge.reading.exporters import ReadHints, choose_exporters, find_cameras_of_model, find_exporter
@@ -199,6 +200,12 @@ def add_larger_and_masks(load: Loaded) -> Loaded:
     if maps is not None and depths is None:
         found = f"{maps.dtype} {list(maps.shape)}, expected floats {list(shape)}, those of the views"
         notes.append(f"the depth maps in {source.camera_file.path} are not used to fill holes: found {found}")
+    covered = scene.covered
+    if maps is None and covered is not None and [one.name for one in load.exporters] == ["da3"]:
+        share = f"{100 - 100 * covered.mean():.0f} % of the pixels have no Gaussian"
+        guess = "those that are added there get guessed depths, since the cameras' file has no depth maps"
+        if covered.mean() < WHOLE_SHARE:
+            notes.append(f'{share}; {guess}: Depth Anything 3 writes them with export_format="npz-gs_ply"')
     scene = replace(scene, large_photos=large, masks=counts, importance=masks.importance, depths=depths)
     notes = [*load.notes, *notes, *mask_notes, *check_notes]
     return replace(load, scene=scene, source=None, notes=tuple(notes), candidates=tuple(choices))

@@ -77,6 +77,13 @@ def test_files_of_a_model_give_cameras_and_photos_of_all_views(tmp_path: Path, n
     assert loaded.scene.num_gaussians == is_there.sum()
 
 
+@pytest.mark.parametrize(("formats", "is_lacking"), [("npz-gs_ply", False), ("colmap-gs_ply", True)])
+def test_missing_depth_maps_of_depth_anything_are_noted(tmp_path: Path, formats: str, is_lacking: bool) -> None:
+    export = MODELS[f"{DA3}, {formats}"](tmp_path / "out")
+    notes = load_scene(export.path, **export.options).notes
+    assert noted(notes, "guessed depths", "npz-gs_ply") == is_lacking
+
+
 @pytest.mark.parametrize("name", ["DepthSplat, the .ply alone", "Flash3D without cameras"])
 def test_rows_of_a_model_without_photos_are_every_pixel_of_a_smaller_grid(tmp_path: Path, name: str) -> None:
     """Where no photo shows that a border was cut off, the rows are every pixel of a smaller grid."""
