@@ -251,7 +251,7 @@ def choose_cameras(
     if frames:
         tried = (IDENTITY, *frames)
         checks = [check_cameras(*rows, frame.move_cameras(inputs.cameras), inputs.images) for frame in tried]
-        best = int(np.argmax([check.score * check.ok for check in checks]))
+        best = np.argmax([check.score * check.ok for check in checks])
         if best > 0:
             return replace(grid, frame=tried[best]), checks[best], []
     poses, check, note = choose_poses(*rows, inputs.cameras, inputs.images, grid.camera_file.convention)
@@ -312,7 +312,8 @@ def _choose_frame(inputs: AlignmentInput, usual: CameraCheck, stated: Sequence[S
     Returns None if no frame fits clearly better. The frames of exporters are tried and, if the cameras as they are do
     not fit, the world turned about its axes, also before and after the frames ``stated`` in a file. ``usual`` is the
     check of the cameras as they are. Colours fit best at the true scale, so the chosen frame must fit better than the
-    same frame at nearby scales. If no frame stands out at the scale of the cameras, the scale is solved for.
+    same frame at nearby scales. If no frame stands out at the scale of the cameras, the scale is solved for, and then,
+    unless colours fit exactly at that scale, a shift, which takes seconds.
     """
     if not len(inputs.images):
         return None
@@ -341,8 +342,11 @@ def _choose_frame(inputs: AlignmentInput, usual: CameraCheck, stated: Sequence[S
     if has_photos and not stands_out:
         # frames of `exporter_frames`: rotated into the first camera, turned to y up, and moved into the first camera
         solved = [_solve_scale(inputs, frame) for frame in (IDENTITY, frames[1], frames[4], frames[-1])]
-        best, score = _best_frame(inputs, [best, *solved, *(_solve_shift(inputs) if is_moved else [])])
+        best, score = _best_frame(inputs, [best, *solved])
         stands_out = _stands_out(inputs, best, score)
+        if is_moved and not (stands_out and _fits_exactly(inputs, best)):
+            best, score = _best_frame(inputs, [best, *_solve_shift(inputs)])
+            stands_out = _stands_out(inputs, best, score)
     if best is IDENTITY or not stands_out:
         return None
     usual_score = max(_score_frame(inputs, IDENTITY), usual.score if usual.ok else 0.0)
@@ -450,7 +454,7 @@ def _solve_scale(inputs: AlignmentInput, frame: Similarity) -> Similarity:
     scale_gaussians = 2000  # Gaussians that the scales are tried on
     scores = np.array([_score_frame(inputs, candidate, scale_gaussians) for candidate in scaled])
     two_steps_away = np.maximum(scores[:-4], scores[4:])
-    best = scaled[2 + int(np.argmax(scores[2:-2] - two_steps_away))]
+    best = scaled[2 + np.argmax(scores[2:-2] - two_steps_away)]
     for max_change, num_scales, samples in _FINER if scores.any() else ():
         factors = exp(np.linspace(-max_change, max_change, num_scales))
         best, _ = _best_frame(inputs, [_scale_frame(best, float(factor)) for factor in factors], samples)
@@ -472,7 +476,7 @@ def _solve_shift(inputs: AlignmentInput) -> list[Similarity]:
     images = inputs.images[some_views]
     to_world = invert(cameras.viewmats)
     centres, points = to_world[:, :3, 3], inputs.gaussians.means[inputs.valid].astype(np.float64)
-    view = int(np.argmin(np.linalg.norm(centres - np.median(centres, 0), axis=1)))
+    view = np.argmin(np.linalg.norm(centres - np.median(centres, 0), axis=1))
     middle = np.median(points, 0)
     radius = np.median(np.linalg.norm(points - middle, axis=1))
     to_ray = radius * matmul(to_world[view, :3, :3], invert(cameras.Ks[view]))
