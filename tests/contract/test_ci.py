@@ -48,7 +48,8 @@ def test_tasks_use_the_python_that_setup_installs(monkeypatch: pytest.MonkeyPatc
 def test_ci_script_runs_the_readmes_line_of_the_tests() -> None:
     script = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
     assert "\npython3 tasks.py setup tests" in script
-    assert re.search(r"^\.venv/bin/python tasks\.py .* site$", script, re.MULTILINE)  # its last line
+    assert re.search(r"^\.venv/bin/python tasks\.py lint types imports docs site\b", script, re.MULTILINE)
+    assert script.endswith("\n.venv/bin/python tasks.py sweeps\n")
     assert "run: .ci/run" in (ROOT / ".github" / "workflows" / "ci.yml").read_text(encoding="utf-8")
 
 
