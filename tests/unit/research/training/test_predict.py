@@ -169,8 +169,7 @@ def measure(crop: Crop, networks: Networks) -> torch.Tensor:
 
 
 @pytest.mark.usefixtures("fixed_choices")
-@sweep("network", [PAPER.network, TINY])
-@sweep("k", [1, 2, 4], often=0)
+@sweep(("network", "k"), [(PAPER.network, 1), (PAPER.network, 4), (TINY, 2), (TINY, 4)], often=0)
 def test_gradients_are_central_differences(network: NetworkOptions, k: int) -> None:
     """For every column that a network makes: each reaches the children, through all stages after its own."""
     networks = noisy_networks(network, scale=0.15).requires_grad_(True)
