@@ -24,9 +24,9 @@ class Effort:
 
 EFFORTS = {
     "draft": Effort(
-        50, 1.0, 0, merges=False, refines=False, prunes=False, fits_alone=False, large_photos=False, report_views=3
+        44, 1.0, 0, merges=False, refines=False, prunes=False, fits_alone=False, large_photos=False, report_views=3
     ),
-    "fast": Effort(80, 1.0, 0, refines=False, large_photos=False),
+    "fast": Effort(72, 1.0, 0, refines=False, large_photos=False),
     "default": Effort(STEPS, 2.0, 0),
     "best": Effort(900, 3.0, 1),
 }
