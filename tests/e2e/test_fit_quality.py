@@ -51,7 +51,7 @@ def test_full_fit_reaches_the_floor_with_no_more_than_the_count(
     floor(actual)
 
 
-@sweep("steps", [20, 60])
+@sweep("steps", [20, 72])
 def test_short_fits_reach_the_floor(
     steps: int, compacted: Callable[..., tuple[CompactResult, float]], floor: Callable[..., None]
 ) -> None:

@@ -106,6 +106,6 @@ def test_file_that_broke_off_is_a_doubt_of_every_command(smallest_copy: Path, ru
     assert "; ".join(doubts) in outcome.err
     for options, code in ((), 0), (("--strict",), 4):  # done, then skipped
         outcome = run("batch", smallest_copy, "-o", out, *FAST, *options, code=code)
-        assert outcome.out.count("; also ".join(doubts)) == 1
+        assert [outcome.out.count(doubt) for doubt in doubts] == [1] * len(doubts)
     (line,) = (json.loads(line) for line in run("batch", smallest_copy, "-o", out, *FAST, "--json").out.splitlines())
     assert line["doubts"] == doubts

@@ -57,16 +57,16 @@ def test_every_setting_works_without_photos(options: tuple[object, ...], bare: P
 @pytest.mark.slow
 @sweep("effort", ["draft", "fast"])
 def test_result_without_photos_is_as_good_as_with_them(effort: str, small_scene: Path, tmp_path: Path) -> None:
-    """Judged by photos that neither has seen, over five seeds, between which results so small differ by 0.5 dB."""
+    """Judged by photos that neither has seen, over ten seeds, between which results so small differ by 0.5 dB."""
     scene, differences = gsmerge.read_scene(small_scene), []
-    for seed in range(5):
+    for seed in range(10):
         actual = []
         for name, one in (("with", scene), ("without", replace(scene, images=None))):
             out = tmp_path / f"{name}-{seed}.ply"
             gsmerge.write_ply(out, gsmerge.compact(one, effort=effort, threads=1, seed=seed).gaussians)
             actual.append(target_psnr(small_scene / "targets", out))
         differences.append(actual[1] - actual[0])
-    assert sum(differences) / 5 > -CLOSE
+    assert sum(differences) / 10 > -CLOSE
 
 
 def test_summary_says_what_the_result_is_measured_against(bare: Path, tmp_path: Path, run: Run) -> None:
