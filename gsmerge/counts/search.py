@@ -231,7 +231,8 @@ class CountSearch:
         if self.is_met or self.plan.keeps_fidelity:
             return None
         reached = self._describe_reached(num_gaussians)
-        return f"quality: {self.target:g} dB was asked for; {reached}, the best that was tried"
+        why = "" if self.left_out is None else "; the result, which has all photos, may show new views better"
+        return f"quality: {self.target:g} dB was asked for; {reached}, the best that was tried{why}"
 
     def _describe_reached(self, num_gaussians: int) -> str:
         """Say which PSNR a result of ``num_gaussians`` reaches."""

@@ -179,13 +179,16 @@ def prepare_fit(job: FitJob) -> FitRun:
         half_weights = [np.where(weight == HIDDEN_WEIGHT, np.float32(0), weight) for weight in score_weights]
         if num_photos == 1:  # no other photo shows the held-out patches, so the fit is scored on all pixels
             score_weights = [np.where(weight == 1, np.float32(0), weight) for weight in score_weights]
+    scored_part = options.half_res_part
+    if options.half_res_share is None:
+        scored_part = min(scored_part, SCORED)
     return FitRun(
         job=job,
         score_weights=score_weights,
         step_weights=(full_weights, _weigh(half_weights, photos[1]), *large_weights),
         dropout=dropout,
         half_part=options.half_res_part,
-        scored_part=min(options.half_res_part, SCORED),
+        scored_part=scored_part,
         samples=can_sample,
         first_pixels=first_pixels,
     )

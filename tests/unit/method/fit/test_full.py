@@ -445,6 +445,8 @@ def test_all_pixels_of_samples_count_once_the_held_out_patches_are_scored(photos
     is_whole = [bool((run.weight(step) == 1).all()) for step in steps]
     assert is_whole == [step.progress >= run.scored_part for step in steps]
     assert 0 < sum(is_whole) < 30
+    asked = prepare_fit(FitJob(photos, FitOptions(fit_steps=60, half_res_share=1.0, holdout=0.2)))
+    assert asked.scored_part == 1  # as where short fits compare counts on patches that no step draws
 
 
 def test_more_gaussians_have_fewer_steps_on_half_size_photos() -> None:
