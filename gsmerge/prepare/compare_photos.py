@@ -13,6 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from gsmerge.arrays import mean_columns
 from gsmerge.errors import Doubt
 from gsmerge.method.compare.assign_photos import Assigner, Candidates
 from gsmerge.method.compare.colors import (
@@ -341,8 +342,7 @@ def _find_hidden(scene: PicturedScene, changes: Sequence[PhotoChange]) -> tuple[
         if spacing > 1:
             photo = convolve(photo, footprint, footprint)
         difference = (photo - picture) * known[..., None]
-        red, green, blue = np.moveaxis(np.abs(convolve(difference, window, window)), -1, 0)
-        differs = known & ((red + green + blue) / 3 > EXPOSURE_STEP * around)
+        differs = known & (mean_columns(np.abs(convolve(difference, window, window))) > EXPOSURE_STEP * around)
         return fill_gaps(differs[..., None], known)[..., 0] if differs.any() else differs
 
     def compare_drawn(views: np.ndarray, drawn: RowPicture) -> None:

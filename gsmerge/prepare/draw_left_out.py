@@ -93,7 +93,7 @@ def draw_left_out(scene: PicturedScene, masks: np.ndarray | None) -> PicturedSce
     own = scene.has_own_pixels
     # pictures already have the colours of the views' own Gaussians, which are solid
     colors = scene.images.copy() if own else np.zeros_like(scene.images)
-    transmittance = np.zeros(counts.shape, np.float32) if own else np.ones(counts.shape, np.float32)
+    transmittance = np.full(counts.shape, not own, np.float32)
 
     def draw(view: int, tiled: TiledView) -> None:
         """Draw a view of the input, or find only where the input shows nothing."""
@@ -108,7 +108,8 @@ def draw_left_out(scene: PicturedScene, masks: np.ndarray | None) -> PicturedSce
     solid = ~find_bare(scene) if own else np.zeros_like(bare)
     if scene.beyond is not None:  # nothing is known there
         bare &= ~scene.beyond
-        solid = solid if own else scene.beyond
+        if not own:
+            solid = scene.beyond
     for view, hole in enumerate(holes):
         left_out = outside[view]
         nothing = _grow(~_grow(~bare[view], HOLE * unit), HOLE * unit)

@@ -109,9 +109,9 @@ def _find_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool) ->
     bare = find_bare(scene)
     has_empty = np.array([is_cropped or (not everywhere and large_parts(part).any()) for part in bare])
     views = [view for view in range(len(scene)) if has_empty[view] or fillable[view].any()]
-    holes, empty, edges = np.zeros_like(fillable), np.zeros_like(fillable), dict[int, _Edges]()
     if not views:
         return None
+    holes, empty, edges = np.zeros_like(fillable), np.zeros_like(fillable), dict[int, _Edges]()
     gap = 2 * round(GAP_WIDTH * max(shown.shape[1:]) / 2) + 1
     # Where each pixel has its own Gaussians, a view without an empty part needs to be drawn only at its holes, and
     # around them if the depth beside them counts. A view of few Gaussians does not know its farthest surface
@@ -151,7 +151,8 @@ def _find_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool) ->
                 pixels = np.flatnonzero(covered)
                 pixels = pixels[:: 1 + len(pixels) // SAMPLE]
                 own_depths = depths.reshape(-1)[pixels].astype(np.float64)
-            known = _fit_map(scene, view, pixels, own_depths)
+            if not is_whole:
+                known = _fit_map(scene, view, pixels, own_depths)
             surfaces = own_depths if view in parts and own_depths.size else depths[covered]
             (farthest,) = quantiles(surfaces, [FARTHEST_QUANTILE])
             edges[view] = _Edges(beside[holes[view]], float(farthest), None if known is None else known[holes[view]])
