@@ -145,7 +145,7 @@ def _run(
                 {}, [*totals.lines(terminal_columns(sys.stdout)), *map("note: {}".format, notes)], as_json=False
             )
     doubtful = totals.reasons["doubt"]
-    num_doubtful = len({scene for scene, _ in doubtful})
+    num_doubtful = totals.count_scenes("doubt")
     results = count_words(totals.total - len(totals.reasons["error"]), "result")
     problem = (
         f"{num_doubtful} of {results} {'is' if num_doubtful == 1 else 'are'} doubtful"
@@ -233,6 +233,10 @@ class Totals:
         seconds = f"{report['total_seconds']:.1f}"
         self.rows.append((record["output"], *counts, share, gain, *quality, seconds))
 
+    def count_scenes(self, kind: str) -> int:
+        """Count the scenes that have reasons of a kind."""
+        return len({scene for scene, _ in self.reasons[kind]})
+
     def lines(self, columns: int | None = None) -> list[str]:
         """Return the last lines of a batch: a table of results, reasons of each kind, and a line of totals.
 
@@ -274,7 +278,7 @@ class Totals:
             share = human_share(self.counts["out"] / num_input)
             total_line += f"; {num_input:,} -> {self.counts['out']:,} Gaussians ({share})"
         for name, words in (("unmet", "missed the target"), ("doubt", "doubtful")):
-            count = len({scene for scene, _ in self.reasons[name]})
+            count = self.count_scenes(name)
             total_line += f"; {count:,} {words}" if count else ""
         return [*lines, total_line]
 
