@@ -201,11 +201,11 @@ def add_larger_and_masks(load: Loaded) -> Loaded:
         found = f"{maps.dtype} {list(maps.shape)}, expected floats {list(shape)}, those of the views"
         notes.append(f"the depth maps in {source.camera_file.path} are not used to fill holes: found {found}")
     covered = scene.covered
-    if maps is None and covered is not None and [one.name for one in load.exporters] == ["da3"]:
+    is_da3 = [one.name for one in load.exporters] == ["da3"]
+    if maps is None and is_da3 and covered is not None and covered.mean() < WHOLE_SHARE:
         share = f"{100 - 100 * covered.mean():.0f} % of the pixels have no Gaussian"
         guess = "those that are added there get guessed depths, since the cameras' file has no depth maps"
-        if covered.mean() < WHOLE_SHARE:
-            notes.append(f'{share}; {guess}: Depth Anything 3 writes them with export_format="npz-gs_ply"')
+        notes.append(f'{share}; {guess}: Depth Anything 3 writes them with export_format="npz-gs_ply"')
     scene = replace(scene, large_photos=large, masks=counts, importance=masks.importance, depths=depths)
     notes = [*load.notes, *notes, *mask_notes, *check_notes]
     return replace(load, scene=scene, source=None, notes=tuple(notes), candidates=tuple(choices))

@@ -251,7 +251,7 @@ def choose_cameras(
     if frames:
         tried = (IDENTITY, *frames)
         checks = [check_cameras(*rows, frame.move_cameras(inputs.cameras), inputs.images) for frame in tried]
-        best = np.argmax([check.score * check.ok for check in checks])
+        best = int(np.argmax([check.score * check.ok for check in checks]))
         if best > 0:
             return replace(grid, frame=tried[best]), checks[best], []
     poses, check, note = choose_poses(*rows, inputs.cameras, inputs.images, grid.camera_file.convention)
@@ -454,7 +454,7 @@ def _solve_scale(inputs: AlignmentInput, frame: Similarity) -> Similarity:
     scale_gaussians = 2000  # Gaussians that the scales are tried on
     scores = np.array([_score_frame(inputs, candidate, scale_gaussians) for candidate in scaled])
     two_steps_away = np.maximum(scores[:-4], scores[4:])
-    best = scaled[2 + np.argmax(scores[2:-2] - two_steps_away)]
+    best = scaled[2 + int(np.argmax(scores[2:-2] - two_steps_away))]
     for max_change, num_scales, samples in _FINER if scores.any() else ():
         factors = exp(np.linspace(-max_change, max_change, num_scales))
         best, _ = _best_frame(inputs, [_scale_frame(best, float(factor)) for factor in factors], samples)
@@ -476,7 +476,7 @@ def _solve_shift(inputs: AlignmentInput) -> list[Similarity]:
     images = inputs.images[some_views]
     to_world = invert(cameras.viewmats)
     centres, points = to_world[:, :3, 3], inputs.gaussians.means[inputs.valid].astype(np.float64)
-    view = np.argmin(np.linalg.norm(centres - np.median(centres, 0), axis=1))
+    view = int(np.argmin(np.linalg.norm(centres - np.median(centres, 0), axis=1)))
     middle = np.median(points, 0)
     radius = np.median(np.linalg.norm(points - middle, axis=1))
     to_ray = radius * matmul(to_world[view, :3, :3], invert(cameras.Ks[view]))
