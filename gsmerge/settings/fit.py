@@ -98,9 +98,9 @@ class FitOptions(Settings):
         "By default 0.1 for at most five views and at least 150 steps, 0.05 for at least 600 steps and 30 steps per "
         "view, otherwise 0.", least=0, below=1)  # fmt: skip
     half_res_share: float | None = setting(None, "Share of the steps, at the start of a run, that draw a quarter of "
-        "the pixels.", "By default 0.8, with at least 600 steps 0.5, with 30 to 149 steps 1; if cameras move, "
-        "photos are larger or steps fewer, 0.7. Less if there are more Gaussians than 4.4 % of the pixels.",
-        least=0, most=1)  # fmt: skip
+        "the pixels.", "By default 0.8, with at least 600 steps 0.5, with less than 20 or 30 to 149 steps 1; if "
+        "cameras move, photos are larger or steps are fewer than 30, 0.7. Less if there are more Gaussians than 4.4 % "
+        "of the pixels.", least=0, most=1)  # fmt: skip
     holdout: float = setting(0.05, "Share of the photos' patches that is held out, to decide whether a fit is "
         "accepted.", above=0, below=1)  # fmt: skip
     min_contribution: float = setting(1 / 255, "Least blending weight of a Gaussian. A fit removes Gaussians that "

@@ -180,7 +180,7 @@ def prepare_fit(job: FitJob) -> FitRun:
         if num_photos == 1:  # no other photo shows the held-out patches, so the fit is scored on all pixels
             score_weights = [np.where(weight == 1, np.float32(0), weight) for weight in score_weights]
     scored_part = options.half_res_part
-    if options.half_res_share is None:
+    if options.half_res_share is None:  # a share that is asked for leaves out the patches of all its samples
         scored_part = min(scored_part, SCORED)
     return FitRun(
         job=job,
