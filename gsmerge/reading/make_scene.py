@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -15,15 +16,16 @@ from gsmerge.io.cameras.read_cameras import list_unread
 from gsmerge.io.formats.read_gaussians import GaussianFile, file_notes
 from gsmerge.io.formats.rows import MAX_STRAY, RESULT_COMMENT
 from gsmerge.io.photo_files import NO_IMAGES, as_floats, photo_size
+from gsmerge.method.compare.view_pictures import show_views
 from gsmerge.method.geometry.transforms import move_views
-from gsmerge.method.raster.photos import WHOLE_SHARE
+from gsmerge.method.raster.photos import WHOLE_SHARE, row_pictures
 from gsmerge.reading.alignment import AlignmentResult, check_pixels, find_pixels
 from gsmerge.reading.choice import make_choice
 from gsmerge.reading.exporters import ReadHints, choose_exporters, find_cameras_of_model, find_exporter
 from gsmerge.reading.larger_photos import PhotoSource, limit_photo_size, limit_view_size, read_larger_and_masks
 from gsmerge.reading.loaded import Loaded
 from gsmerge.reading.photos.masks import NO_MASKS, CameraMaskError, check_masks
-from gsmerge.reading.photos.scene_photos import ScenePhotos, without_photo
+from gsmerge.reading.photos.scene_photos import ScenePhotos
 from gsmerge.reading.scene_files import SceneFiles
 from gsmerge.reading.take_gaussians import take_gaussians
 from gsmerge.runtime.record import list_some
@@ -218,3 +220,20 @@ def _with_choice(error: SceneError, load: Loaded, place: Path | str | None, reas
         choice = make_choice(load.files, "masks", place, reason, chosen=False, can_be_named=False)
         error.candidates += (choice,)
     return error
+
+
+def without_photo(scene: Scene, views: Sequence[int]) -> Scene:
+    """Return a scene with pictures of its Gaussians in place of the photos of ``views``; their pixels do not count."""
+    if scene.images is None:
+        return scene
+    images = scene.images.copy()
+    ids = list(views)
+    shape = len(scene), scene.cameras.height, scene.cameras.width
+    masks = np.ones(shape, bool) if scene.masks is None else scene.masks.copy()
+    masks[ids] = False
+    images[ids] = (
+        row_pictures(scene)[ids]
+        if scene.has_own_pixels
+        else show_views(replace(scene, masks=None), max(shape))[ids].pictures
+    )
+    return replace(scene, images=images, masks=masks)

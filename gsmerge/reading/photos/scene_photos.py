@@ -49,7 +49,6 @@ from gsmerge.method.compare.assign_photos import Assigner, Candidates, assign_ph
 from gsmerge.method.compare.offsets import OFFSET_PIXELS, correlate_parts
 from gsmerge.method.compare.view_pictures import ViewPictures, show_views
 from gsmerge.method.kernels.pictures import turn_picture
-from gsmerge.method.raster.photos import row_pictures
 from gsmerge.reading.alignment import CROPPED, ESTIMATED
 from gsmerge.reading.photos.grid_fit import WHOLE_FIT, GridFit, PartFit, choose_fit, list_fits
 from gsmerge.reading.scene_files import SceneFiles, list_folders
@@ -578,20 +577,3 @@ def explain_mismatch(photos: ScenePhotos, camera_file: CameraFile) -> MismatchEr
     reasons = f" ({list_faults(faults)})" if faults else ""
     problem = f"expected photos of {views}, found {found}{reasons}"
     return MismatchError(photos.folder, problem, f"name their folder with --images; {CROPPED}")
-
-
-def without_photo(scene: Scene, views: Sequence[int]) -> Scene:
-    """Return a scene with pictures of its Gaussians in place of the photos of ``views``; their pixels do not count."""
-    if scene.images is None:
-        return scene
-    images = scene.images.copy()
-    ids = list(views)
-    shape = len(scene), scene.cameras.height, scene.cameras.width
-    masks = np.ones(shape, bool) if scene.masks is None else scene.masks.copy()
-    masks[ids] = False
-    images[ids] = (
-        row_pictures(scene)[ids]
-        if scene.has_own_pixels
-        else show_views(replace(scene, masks=None), max(shape))[ids].pictures
-    )
-    return replace(scene, images=images, masks=masks)

@@ -19,7 +19,7 @@ from gsmerge.method.raster.photos import MASKED_WEIGHT, scene_pictures
 from gsmerge.method.stages.fit_pairs import merge_scene
 from gsmerge.method.viewpoints.place_cameras import HELD_OUT
 from gsmerge.prepare.prepare_scene import prepare
-from gsmerge.reading.photos.scene_photos import without_photo
+from gsmerge.reading.make_scene import without_photo
 from gsmerge.runtime.record import record_part, record_run
 from gsmerge.types import NO_CAMERAS, make_scene
 
