@@ -70,7 +70,8 @@ _REDUCTIONS = {  # number by which each side is divided -> OpenCV's flag
 _PNG_CHUNKS = frozenset({b"IHDR", b"PLTE", b"tRNS", b"IDAT"})  # chunks that determine the pixels
 
 Size = tuple[int, int]  # width and height in pixels
-Part = tuple[float, float, float, float]  # left, top, right and bottom of a part of a photo, as shares of its sides
+# Left, top, right and bottom of a part of a photo, as shares of its sides; a part may reach beyond the photo
+Part = tuple[float, float, float, float]
 WHOLE: Part = (0.0, 0.0, 1.0, 1.0)  # all of a photo
 _AT_ONCE = 128 << 20  # most bytes of decoded photos in memory; if they need more, photos are decoded at each use
 
@@ -128,17 +129,15 @@ def decode_photos(
     paths: Sequence[Path | None],
     turns: Sequence[int],
     size: Size,
-    part: Part = WHOLE,
+    parts: Sequence[Part] | None = None,
     damaged: dict[Path, str] | None = None,
-    canvas: Size | None = None,
 ) -> PhotoArrays:
-    """Decode the photo of each view, turn it upright, and resize a ``part`` of it to ``[h,w,3]`` uint8 of one ``size``.
+    """Decode the photo of each view, turn it upright, and resize a part of it to ``[h,w,3]`` uint8 of one ``size``.
 
-    If there is a ``canvas``, photos are extended to it first, see :func:`extend_picture`.
-    ``turns`` are those of :func:`orientation_turn`. A view without a file gets a black photo. If all photos together
-    are large, they are decoded at each use. Otherwise each photo is decoded once, even if several views have the same
-    photo. Raise SceneError as in :func:`decode_images`; but if ``damaged`` is given, a photo that cannot be decoded is
-    black, and ``damaged`` gets its path and the reason.
+    ``parts`` has the part of each photo; None for whole photos. ``turns`` are those of :func:`orientation_turn`. A view
+    without a file gets a black photo. If all photos together are large, they are decoded at each use. Otherwise each
+    photo is decoded once, even if several views have the same photo. Raise SceneError as in :func:`decode_images`; but
+    if ``damaged`` is given, a photo that cannot be decoded is black, and ``damaged`` gets its path and the reason.
     """
     files = list(dict.fromkeys(path for path in paths if path is not None))
     sizes = {path: image_size(path) for path in files}
@@ -151,9 +150,9 @@ def decode_photos(
         found = f"found {count:,} of {size[0]} x {size[1]}, {num_bytes / 1e6:,.0f} MB"
         raise SceneError(files[0].parent, f"{problem}, {found}", "reduce their size, or leave some out")
 
-    def decode(view: tuple[Path | None, int]) -> np.ndarray:
-        """Decode, turn, cut and resize the photo of a ``view``, given as the photo's path and turn."""
-        path, turn = view
+    def decode(view: tuple[Path | None, int, Part]) -> np.ndarray:
+        """Decode, turn, cut and resize the photo of a ``view``, given as the photo's path, turn and part."""
+        path, turn, part = view
         if path is None:
             return np.zeros((size[1], size[0], 3), np.uint8)
         try:
@@ -163,32 +162,16 @@ def decode_photos(
                 raise
             damaged[path] = error.problem
             return np.zeros((size[1], size[0], 3), np.uint8)
-        upright = extend_picture(turn_picture(whole, turn), canvas)
-        photo = np.ascontiguousarray(cut_part(upright, part))
+        photo = np.ascontiguousarray(cut_part(turn_picture(whole, turn), part))
         photo_size = photo.shape[1], photo.shape[0]
         return photo if photo_size == size else resize_to(photo_size, size).photos([photo])[0]
 
-    views = list(zip(paths, turns, strict=True))
+    views = list(zip(paths, turns, parts or [WHOLE] * len(paths), strict=True))
     different = list(dict.fromkeys(views))
     if _CHANNELS * size[0] * size[1] * len(different) > _AT_ONCE:
         return PhotoReader(len(views), size, lambda view: decode(views[view]))
     decoded = dict(zip(different, parallel_map(decode, different), strict=True))
     return [decoded[view] for view in views]
-
-
-def extend_picture(picture: np.ndarray, canvas: Size | None, size: Size | None = None) -> np.ndarray:
-    """Extend a picture ``[h,w,...]`` to the size ``canvas`` by zeros, to the right and below.
-
-    If the picture is a photo of ``size`` at another size, it is extended by the same share as the photo. Without a
-    canvas, return the picture itself.
-    """
-    size = size or picture.shape[1::-1]
-    if canvas is None or canvas == size:
-        return picture
-    width, height = (round(side * new / old) for side, new, old in zip(picture.shape[1::-1], canvas, size, strict=True))
-    out = np.zeros((max(height, len(picture)), max(width, picture.shape[1]), *picture.shape[2:]), picture.dtype)
-    out[: len(picture), : picture.shape[1]] = picture
-    return out
 
 
 def decode_small(path: Path, side: int) -> np.ndarray:
@@ -285,11 +268,24 @@ def part_size(size: Size, part: Part) -> Size:
 
 
 def cut_part(photo: np.ndarray, part: Part) -> np.ndarray:
-    """Cut a part out of a photo ``[h,w,...]``. The returned array shares the photo's memory."""
+    """Cut a part out of a photo ``[h,w,...]``, and extend it by zeros where it reaches beyond the photo.
+
+    A part inside the photo shares the photo's memory.
+    """
     width, height = part_size(photo.shape[1::-1], part)
     left = round(photo.shape[1] * part[0])
     top = round(photo.shape[0] * part[1])
-    return photo[top : top + height, left : left + width]
+    inside = photo[max(top, 0) : top + height, max(left, 0) : left + width]
+    if inside.shape[:2] == (height, width):
+        return inside
+    out = np.zeros((height, width, *photo.shape[2:]), photo.dtype)
+    out[max(-top, 0) :, max(-left, 0) :][: len(inside), : inside.shape[1]] = inside
+    return out
+
+
+def reaches_beyond(part: Part) -> bool:
+    """Return whether a part reaches beyond its photo."""
+    return min(part) < 0 or max(part) > 1
 
 
 def same_shape(size: Size, other: Size) -> bool:

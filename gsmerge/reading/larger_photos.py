@@ -75,9 +75,8 @@ def read_larger_and_masks(
         """Return the larger photo of a view."""
         if not photos.paths:
             return cut(view, photos.pictures[view])
-        path = photos.paths[view]
-        turn = photos.turns[view]
-        return cut(view, decode_photos([path], [turn], stored, photos.fit.part, canvas=photos.canvas)[0])
+        of_view = slice(view, view + 1)
+        return cut(view, decode_photos(photos.paths[of_view], photos.turns[of_view], stored, photos.parts[of_view])[0])
 
     large = None
     if (scale * reduction).max() < 1:  # the window has more pixels than the view on both sides

@@ -62,6 +62,16 @@ class PartFit:
 WHOLE_FIT = PartFit()
 
 
+def clear_beyond(weights: np.ndarray, part: Part) -> None:
+    """Set the weights ``[h,w]`` of a part's pixels to 0 where the part reaches beyond its photo."""
+    left, top, right, bottom = part
+    height, width = weights.shape
+    weights[: max(0, round(height * top / (top - bottom)))] = 0
+    weights[max(0, round(height * (1 - top) / (bottom - top))) :] = 0
+    weights[:, : max(0, round(width * left / (left - right)))] = 0
+    weights[:, max(0, round(width * (1 - left) / (right - left))) :] = 0
+
+
 @dataclass(frozen=True)
 class GridFit:
     """How a model resized and cropped photos to a grid; the Gaussians of its pixels are the rows of a file."""

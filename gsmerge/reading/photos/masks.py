@@ -13,6 +13,7 @@ from gsmerge.frozen import dataclass
 from gsmerge.io.cameras.camera_file import CameraFile
 from gsmerge.io.image_names import find_image, match_masks
 from gsmerge.io.photo_files import (
+    WHOLE,
     Part,
     PhotoArrays,
     Size,
@@ -20,9 +21,9 @@ from gsmerge.io.photo_files import (
     decode_alpha,
     decode_levels,
     decode_small,
-    extend_picture,
     image_size,
     limit_size,
+    reaches_beyond,
     same_shape,
 )
 from gsmerge.method.compare.offsets import OFFSET_PIXELS
@@ -62,9 +63,8 @@ class MaskFiles:
     turns: Sequence[int]  # orientation of each photo's file, 0 to 7; odd if the photo is stored on its side
     masks: Sequence[Path | None]  # dark where a photo does not count
     protecting: Sequence[Path | None]  # white where a photo counts more
-    part: Part  # the part of each upright photo that is used
-    canvas: Size | None  # size to which upright photos are extended; what is added does not count
-    stored: Size  # size of this part
+    parts: Sequence[Part]  # the part of each upright photo that is used; what lies beyond the photo does not count
+    stored: Size  # size of these parts
     cut: Callable[[int, np.ndarray], np.ndarray]  # view, picture of the size ``stored`` -> what the view shows of it
     cameras: Cameras
     stored_counts: np.ndarray | None = None  # [v,h,w] bool, where photos inside another file count; None: everywhere
@@ -73,21 +73,21 @@ class MaskFiles:
     def read(self, view: int) -> tuple[np.ndarray | None, np.ndarray | None]:
         """Read which pixels ``[h,w]`` of a view count, and their weights ``[h,w]``; None: all count, with weight 1."""
         photo = self.photos[view] if self.photos else None
+        part = self.parts[view]
         counts = None
         importance: np.ndarray | None = None
         alpha = None if self.stored_counts is None else self.stored_counts[view]  # only of photos without files
         if photo is not None and not self.is_plain:
             alpha = decode_alpha(photo)
         min_level = 191  # level of 255; a pixel counts if three quarters of the file's pixels in it count
-        if photo is not None and self.canvas not in (None, image_size(photo)):
+        if photo is not None and reaches_beyond(part):
             whole = np.full(image_size(photo)[::-1], True)
             alpha = whole if alpha is None else alpha
-            inside = extend_picture(turn_picture(whole, self.turns[view]), self.canvas)
+            inside = cut_part(turn_picture(whole, self.turns[view]), part)
             importance = (self._reduce(inside * _WHITE, view) > 0).astype(np.float32)  # 0 beyond the photo
         if alpha is not None:
-            upright = extend_picture(turn_picture(alpha, self.turns[view]), self.canvas)
-            opaque = cut_part(upright, self.part) * _WHITE
-            counts = self._reduce(opaque, view) > min_level
+            opaque = cut_part(turn_picture(alpha, self.turns[view]), part)
+            counts = self._reduce(opaque * _WHITE, view) > min_level
         if (mask := self.masks[view]) is not None:
             levels = self._read_levels(mask, view)
             is_light = levels > _WHITE // 2
@@ -113,7 +113,7 @@ class MaskFiles:
                 whole = turn_picture(whole, turns)
             upright = size[::-1] if turns % 2 else size
             if same_shape(upright, whole.shape[1::-1]):
-                whole = cut_part(extend_picture(whole, self.canvas, upright), self.part)
+                whole = cut_part(whole, self.parts[view])
         if not same_shape(self.stored, whole.shape[1::-1]):
             width, height = self.stored
             columns, lines = whole.shape[1::-1]
@@ -179,11 +179,10 @@ def read_masks(
     masks = list_by_view(photo_masks)
     protecting = list_by_view(photo_protecting)
     turns = photos.turns or (0,) * len(masks)
-    part = photos.fit.part
-    canvas = photos.canvas
+    parts = photos.parts or (WHOLE,) * len(masks)
     stored_counts = None if paths or is_plain else camera_file.counts
     mask_files = MaskFiles(
-        tuple(paths), turns=turns, masks=masks, protecting=protecting, part=part, canvas=canvas, stored=stored, cut=cut,
+        tuple(paths), turns=turns, masks=masks, protecting=protecting, parts=parts, stored=stored, cut=cut,
         cameras=cameras, stored_counts=stored_counts, is_plain=is_plain,
     )  # fmt: skip
     counts, importance = zip(*parallel_map(mask_files.read, range(len(masks))), strict=True)

@@ -34,12 +34,13 @@ from gsmerge.io.image_names import (
 )
 from gsmerge.io.photo_files import (
     ASPECT_TOLERANCE,
+    WHOLE,
+    Part,
     PhotoArrays,
     Size,
     decode_images,
     decode_photos,
     decode_small,
-    extend_picture,
     image_size,
     orientation_turn,
     part_size,
@@ -50,7 +51,7 @@ from gsmerge.method.compare.offsets import OFFSET_PIXELS, correlate_parts
 from gsmerge.method.compare.view_pictures import ViewPictures, show_views
 from gsmerge.method.kernels.pictures import turn_picture
 from gsmerge.reading.alignment import CROPPED, ESTIMATED
-from gsmerge.reading.photos.grid_fit import WHOLE_FIT, GridFit, PartFit, choose_fit, list_fits
+from gsmerge.reading.photos.grid_fit import WHOLE_FIT, GridFit, PartFit, choose_fit, clear_beyond, list_fits
 from gsmerge.reading.scene_files import SceneFiles, list_folders
 from gsmerge.runtime.record import list_faults, list_some
 from gsmerge.runtime.threads import parallel_map
@@ -83,8 +84,7 @@ class ScenePhotos:
     paths: tuple[Path | None, ...] = ()  # the photo of each camera; None for a camera without a photo
     turns: tuple[int, ...] = ()  # orientation of each photo, 0 to 7; see gsmerge.method.kernels.pictures.turn_picture
     faults: tuple[str | None, ...] = ()  # for each camera, why its photo cannot be used; None for no fault
-    # Size to which upright photos of several shapes are extended, see gsmerge.io.photo_files.extend_picture; None: all
-    # have one shape
+    # Size to which upright photos of several shapes are extended, to the right and below; None: all have one shape
     canvas: Size | None = None
     fit: PartFit = WHOLE_FIT  # the part of each upright photo that is used
     grid_fit: GridFit | None = None  # how files are resized and cropped to the grid of rows, if cameras are estimated
@@ -105,11 +105,25 @@ class ScenePhotos:
         sizes = self.list_sizes()
         return max(set(sizes), key=lambda size: (sizes.count(size), size[0] * size[1])) if sizes else None
 
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        """The part of the upright photo of each camera that is used."""
+        return tuple(WHOLE if size is None else self.part_of(size) for size in self._list_upright())
+
+    def part_of(self, size: Size) -> Part:
+        """Return the part of an upright photo of a ``size`` that is used."""
+        across, down = np.divide(self.canvas or size, size).tolist()
+        left, top, right, bottom = self.fit.part
+        return left * across, top * down, right * across, bottom * down
+
     def list_sizes(self) -> list[Size]:
         """List the size of the used part of each photo when it is upright."""
-        stored = [(image_size(path), turn) for path, turn in zip(self.paths, self.turns, strict=True) if path]
-        upright = [size[::-1] if turn % 2 else size for size, turn in stored]
-        return [part_size(self.canvas or size, self.fit.part) for size in upright]
+        return [part_size(size, self.part_of(size)) for size in self._list_upright() if size is not None]
+
+    def _list_upright(self) -> list[Size | None]:
+        """List the size of each camera's photo when it is upright; None without a photo."""
+        sizes = [None if path is None else image_size(path) for path in self.paths]
+        return [size[::-1] if size and turn % 2 else size for size, turn in zip(sizes, self.turns, strict=True)]
 
     def without_files(self, reasons: Mapping[Path, str]) -> ScenePhotos:
         """Return a copy without files that cannot be used, each with the reason.
@@ -323,11 +337,7 @@ def read_photos(photos: ScenePhotos, camera_file: CameraFile) -> ScenePhotos:
             problem = f"expected photos with one aspect ratio, found {width} x {height} and {size[0]} x {size[1]}"
             raise SceneError(photos.folder, problem)
     damaged = dict[Path, str]()
-    part = photos.fit.part
-    canvas = photos.canvas
-    pictures = decode_photos(
-        photos.paths, photos.turns, size=photos.fit.stretch(size), part=part, damaged=damaged, canvas=canvas
-    )
+    pictures = decode_photos(photos.paths, photos.turns, photos.fit.stretch(size), photos.parts, damaged)
     return replace(photos, pictures=pictures, damaged=damaged)
 
 
@@ -394,9 +404,11 @@ def _list_candidates(photos: ScenePhotos) -> Candidates:
     def read(number: int) -> np.ndarray:
         """Read a small version of a photo, and cut out the part that is used."""
         path = photos.pool[number]
-        read = attempt(lambda: extend_picture(decode_small(path, OFFSET_PIXELS), photos.canvas, image_size(path)))
-        black = np.zeros((OFFSET_PIXELS, OFFSET_PIXELS, 3), np.float32)
-        small = photos.fit.cut(black if isinstance(read, SceneError) else read)
+        read = attempt(decode_small, path, OFFSET_PIXELS)
+        if isinstance(read, SceneError):
+            read = np.zeros((OFFSET_PIXELS, OFFSET_PIXELS, 3), np.float32)
+        fit = photos.fit if photos.canvas is None else replace(photos.fit, part=photos.part_of(image_size(path)))
+        small = fit.cut(read)
         return small if photos.grid_fit is None else photos.grid_fit.cut(small)
 
     return Candidates(read, len(photos.pool), lambda number: orientation_turn(photos.pool[number]))
@@ -425,11 +437,8 @@ def assign_to_views(scene: Scene, photos: ScenePhotos, camera_file: CameraFile, 
         """Make pictures of the views, without what lies beyond the photos that are proposed for them."""
         shown = show_views(replace(scene, masks=None), side)
         for view, path in enumerate(photos.named):
-            if photos.canvas is not None and path is not None:
-                height, width = shown.weights.shape[1:]
-                shares = np.divide(image_size(path), photos.canvas)
-                shown.weights[view, round(height * shares[1]) :] = 0
-                shown.weights[view, :, round(width * shares[0]) :] = 0
+            if path is not None:
+                clear_beyond(shown.weights[view], photos.part_of(image_size(path)))
         return shown
 
     assigned, explain_most = assign_photos(show, candidates, named, exact=photos.exact, stored=stored)

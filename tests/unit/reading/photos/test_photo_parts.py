@@ -10,11 +10,13 @@ import cv2
 import numpy as np
 import pytest
 from exports import smooth_scene
+from hypothesis import given
+from hypothesis import strategies as st
 from messages import noted
 
-from gsmerge.io.photo_files import cut_part, part_size
+from gsmerge.io.photo_files import cut_part, part_size, reaches_beyond
 from gsmerge.method.geometry.transforms import sh0_to_rgb
-from gsmerge.reading.photos.grid_fit import PartFit
+from gsmerge.reading.photos.grid_fit import PartFit, clear_beyond
 from gsmerge.reading.photos.photo_parts import list_parts
 from gsmerge.reading.read_scene import load_scene
 
@@ -108,3 +110,15 @@ def test_part_of_a_photo_is_cut_by_shares_of_its_sides() -> None:
     photo = np.arange(4 * 8 * 3, dtype=np.uint8).reshape(4, 8, 3)
     assert np.array_equal(cut_part(photo, (0.5, 0.25, 1, 1)), photo[1:, 4:])
     assert PartFit((0, 0, 0.5, 1), (8, 4)).cut(photo).shape == (4, 8, 3)
+
+
+@given(st.integers(-3, 7), st.integers(-3, 4), st.integers(4, 12), st.integers(4, 12))
+def test_a_part_that_reaches_beyond_a_photo_is_extended_by_zeros(left: int, top: int, width: int, height: int) -> None:
+    photo = 1 + np.arange(8 * 5).reshape(5, 8)
+    shares = (left / 8, top / 5, (left + width) / 8, (top + height) / 5)
+    padded = np.pad(photo, 20)[20 + top : 20 + top + height, 20 + left : 20 + left + width]
+    assert np.array_equal(cut_part(photo, shares), padded)
+    assert reaches_beyond(shares) == (left < 0 or top < 0 or left + width > 8 or top + height > 5)
+    weights = np.ones((height, width), np.float32)
+    clear_beyond(weights, shares)
+    assert np.array_equal(weights > 0, padded > 0)
