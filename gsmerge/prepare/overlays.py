@@ -19,7 +19,7 @@ from gsmerge.method.compare.view_pictures import fit_size
 from gsmerge.method.geometry.transforms import median, medians, project
 from gsmerge.method.geometry.views import even_views, take_rows
 from gsmerge.method.kernels.pictures import blur, sample_bilinear, sobel
-from gsmerge.method.raster.photos import counting_pixels
+from gsmerge.method.raster.photos import counting_pixels, pixel_weights
 from gsmerge.prepare.photo_change import KEEP
 from gsmerge.types import PicturedScene
 
@@ -94,9 +94,9 @@ def leave_out_overlays(scene: PicturedScene) -> tuple[PicturedScene, np.ndarray 
 def _grow_in_photos(scene: PicturedScene, part: np.ndarray) -> np.ndarray:
     """Return the pixels ``[v,h,w]`` of an overlay, which covers the ``part [h,w]`` of all photos, and more of some.
 
-    Borders of photos that were stabilised differ by a few pixels. A pixel beside the part belongs to it if it has the
-    same colour, up to the usual difference of photos within the part. A mark through which the scene is seen has no
-    colour of its own, and does not grow.
+    Borders of photos that were stabilised differ by a few pixels. A pixel beside the part belongs to it if it counts,
+    and if it has the same colour, up to the usual difference of photos within the part. A mark through which the scene
+    is seen has no colour of its own, and does not grow.
     """
     views = scene.photo_views
     overlay = np.repeat(part[None], len(scene), 0)
@@ -107,6 +107,7 @@ def _grow_in_photos(scene: PicturedScene, part: np.ndarray) -> np.ndarray:
     if noise > OPAQUE:
         return overlay
     least = np.float32(noise + ROUNDING)
+    counting = counting_pixels(scene)
     for view, difference in zip(views, differences, strict=True):
         photo = scene.images[view]
         mark = np.zeros(part.shape, bool)  # pixels that show the mark, and not the scene beside it
@@ -114,7 +115,7 @@ def _grow_in_photos(scene: PicturedScene, part: np.ndarray) -> np.ndarray:
         for _ in range(max(1, round(BORDER_STEPS * max(part.shape) / SIDE))):
             low = cv2.erode(np.where(mark[..., None], photo, np.float32(2)), SMALL)
             high = cv2.dilate(np.where(mark[..., None], photo, np.float32(-2)), SMALL)
-            mark |= ((photo >= low - least) & (photo <= high + least)).all(-1)
+            mark |= ((photo >= low - least) & (photo <= high + least)).all(-1) & counting[view]
         overlay[view] |= mark
     return overlay
 
@@ -125,19 +126,21 @@ def find_overlay(scene: PicturedScene) -> np.ndarray | None:
     views = [views[i] for i in even_views(len(views), min(len(views), MOST_VIEWS))]
     size = fit_size((scene.cameras.width, scene.cameras.height), SIDE)
     photos = np.stack([cv2.resize(scene.images[view], size, interpolation=cv2.INTER_AREA) for view in views])
-    first = _vote(scene, views, photos, step=2, partners=QUICK_PARTNERS)
+    inside = pixel_weights(scene.masks, *size)
+    counts = np.full(photos.shape[:3], True) if inside is None else inside[views] == 1
+    first = _vote(scene, views, photos, counts, step=2, partners=QUICK_PARTNERS)
     slopes = np.stack([np.stack(sobel(mean_columns(photo)), -1) / 8 for photo in photos])
     usual_slopes = medians(slopes)
     near_edge = _grow(_find_edges(slopes, usual_slopes, first.noise), SMALL)
     if (first.seeds & near_edge[::2, ::2]).mean() < LEAST_SEEDS:
         return None
-    by_color = _vote(scene, views, photos, step=1, partners=PARTNERS)
-    by_slope = _vote(scene, views, slopes, step=1, partners=PARTNERS)
+    by_color = _vote(scene, views, photos, counts, step=1, partners=PARTNERS)
+    by_slope = _vote(scene, views, slopes, counts, step=1, partners=PARTNERS)
     edges = _find_edges(slopes, usual_slopes, by_slope.noise)
     seeds = by_color.seeds | (by_slope.seeds & edges)
     picture = medians(photos)
     is_constant = mean_columns(np.abs(photos - picture)).mean(0) < by_color.noise / 2
-    joined = seeds | is_constant | (edges & _grow(seeds, BESIDE))
+    joined = (seeds | is_constant | (edges & _grow(seeds, BESIDE))) & counts.any(0)
     joined = cv2.morphologyEx(joined.astype(np.uint8), cv2.MORPH_CLOSE, SMALL)
     number, labels = cv2.connectedComponents(joined, connectivity=8)
     texture = mean_columns(np.abs(picture - blur(picture, 1.5)))
@@ -163,8 +166,10 @@ def find_overlay(scene: PicturedScene) -> np.ndarray | None:
     return _grow_letters(part, weak_edges & ~(by_color.denied | by_slope.denied))
 
 
-def _vote(scene: PicturedScene, views: Sequence[int], values: np.ndarray, *, step: int, partners: int) -> _Votes:
-    """Compare the two predictions of values ``[v,h,w,c]`` of small photos, at each ``step``-th pixel."""
+def _vote(
+    scene: PicturedScene, views: Sequence[int], values: np.ndarray, counts: np.ndarray, *, step: int, partners: int
+) -> _Votes:
+    """Compare the two predictions of values ``[v,h,w,c]`` of small photos, at each ``step``-th pixel that counts."""
     count, height, width = values.shape[:3]
     scale = np.array([scene.cameras.width / width, scene.cameras.height / height])
     x, y = np.meshgrid(np.arange(0, width, step, dtype=np.float32), np.arange(0, height, step, dtype=np.float32))
@@ -190,7 +195,7 @@ def _vote(scene: PicturedScene, views: Sequence[int], values: np.ndarray, *, ste
             v = np.where(inside, v, 0)
             moved = inside & (np.abs(u - x) + np.abs(v - y) > MOVED)
             near_error, far_error = mean_columns(np.abs(own - sample_bilinear(values[other], u, v)))
-            tells.append(moved[0] & (rows >= 0))
+            tells.append(moved[0] & (rows >= 0) & counts[number, ::step, ::step])
             by_rows.append(np.where(moved[1], np.minimum(near_error, far_error), near_error))
             by_pixel.append(mean_columns(np.abs(own - values[other, ::step, ::step])))
     told = np.stack(tells)

@@ -79,6 +79,15 @@ def test_what_the_scene_explains_stays(room: Scene, paint: Callable[[np.ndarray,
     assert leave_out_overlays(scene) == (scene, None, "")
 
 
+def test_pixels_that_do_not_count_say_nothing(room: Scene) -> None:
+    """Photos that were cropped are extended by black pixels, which all of them have at the same places."""
+    masks = np.full((VIEWS, HEIGHT, WIDTH), True)
+    masks[:, :, :14] = False
+    images = room.images * masks[..., None]
+    assert leave_out_overlays(pictured(replace(room, images=images)))[1] is not None
+    assert leave_out_overlays(pictured(replace(room, images=images, masks=masks)))[1] is None
+
+
 def test_too_few_photos_decide_nothing(room: Scene) -> None:
     scene = pictured(subset(painted(room, paint_badge), [0, 2, 4]))
     assert leave_out_overlays(scene) == (scene, None, "")
