@@ -15,7 +15,17 @@ import numpy as np
 
 from gsmerge.frozen import dataclass, replace
 from gsmerge.io.cameras.camera_file import CameraFile
-from gsmerge.io.photo_files import WHOLE, Part, PhotoTransform, Size, cut_part, part_size, resize_and_crop, resize_to
+from gsmerge.io.photo_files import (
+    WHOLE,
+    Part,
+    PhotoTransform,
+    Size,
+    cut_part,
+    part_size,
+    reaches_beyond,
+    resize_and_crop,
+    resize_to,
+)
 from gsmerge.method.compare.offsets import correlate_parts
 from gsmerge.method.compare.similarity import stands_out
 from gsmerge.method.compare.view_pictures import ViewPictures
@@ -49,6 +59,10 @@ class PartFit:
         """Return a note on which part of photos of a ``size`` is used; with ``bars``, only bars are cut off."""
         photo_text = "{} x {}".format(*size)
         part = part_size(size, self.part)
+        if reaches_beyond(self.part):
+            place = f"from column {-round(size[0] * self.part[0])} and line {-round(size[1] * self.part[1])} on"
+            whole = "{} x {}".format(*part)
+            return f"photos of {photo_text} are put into pictures of {whole} {place}, since they are crops of the views"
         part_text = "{} x {}".format(*part)
         if bars:
             return f"bars around the photos are cut off: {photo_text} pixels become {part_text}"

@@ -64,6 +64,7 @@ class MaskFiles:
     masks: Sequence[Path | None]  # dark where a photo does not count
     protecting: Sequence[Path | None]  # white where a photo counts more
     parts: Sequence[Part]  # the part of each upright photo that is used; what lies beyond the photo does not count
+    is_canvas: bool  # True: the view, too, ends where the photo does, and what lies beyond has a weight of 0
     stored: Size  # size of these parts
     cut: Callable[[int, np.ndarray], np.ndarray]  # view, picture of the size ``stored`` -> what the view shows of it
     cameras: Cameras
@@ -83,8 +84,9 @@ class MaskFiles:
         if photo is not None and reaches_beyond(part):
             whole = np.full(image_size(photo)[::-1], True)
             alpha = whole if alpha is None else alpha
-            inside = cut_part(turn_picture(whole, self.turns[view]), part)
-            importance = (self._reduce(inside * _WHITE, view) > 0).astype(np.float32)  # 0 beyond the photo
+            if self.is_canvas:
+                inside = cut_part(turn_picture(whole, self.turns[view]), part)
+                importance = (self._reduce(inside * _WHITE, view) > 0).astype(np.float32)
         if alpha is not None:
             opaque = cut_part(turn_picture(alpha, self.turns[view]), part)
             counts = self._reduce(opaque * _WHITE, view) > min_level
@@ -182,8 +184,8 @@ def read_masks(
     parts = photos.parts or (WHOLE,) * len(masks)
     stored_counts = None if paths or is_plain else camera_file.counts
     mask_files = MaskFiles(
-        tuple(paths), turns=turns, masks=masks, protecting=protecting, parts=parts, stored=stored, cut=cut,
-        cameras=cameras, stored_counts=stored_counts, is_plain=is_plain,
+        tuple(paths), turns=turns, masks=masks, protecting=protecting, parts=parts, is_canvas=photos.canvas is not None,
+        stored=stored, cut=cut, cameras=cameras, stored_counts=stored_counts, is_plain=is_plain,
     )  # fmt: skip
     counts, importance = zip(*parallel_map(mask_files.read, range(len(masks))), strict=True)
     error, place = (CameraMaskError, camera_file.path) if by_cameras else (SceneError, files.masks or "")
@@ -312,7 +314,7 @@ def check_masks(masks: Masks, files: SceneFiles, scene: Scene) -> tuple[Masks, s
         )
         return NO_MASKS, reason, [Doubt(f"masks are not used: {where}: they {reason}; {remedy}")]
     count = int((~counts.all((1, 2))).sum())
-    kind = "transparency or masks" if files.masks is None else "masks"
+    kind = "transparency, masks or crops" if files.masks is None else "masks"
     return masks, reason, [f"{kind} {reason}; {count} of {len(counts)} photos have a mask"]
 
 

@@ -1,13 +1,17 @@
 """Find which part of the photos the views show, if the photos have another shape than their cameras.
 
 Photos may have bars, or show both eyes of a stereo camera or several pictures side by side. Bars are cut off, and one
-of the pictures is used: the part by which photos best match the pictures of the Gaussians.
+of the pictures is used: the part by which photos best match the pictures of the Gaussians. Photos that were cropped
+after the model saw them show a part of their views, and are put in its place.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import product
 
+import cv2
 import numpy as np
 
 from gsmerge.errors import SceneError, attempt
@@ -28,11 +32,13 @@ from gsmerge.io.photo_files import (
     same_shape,
 )
 from gsmerge.method.compare.assign_photos import Assigner, Assignment, Candidates
-from gsmerge.method.compare.offsets import OFFSET_PIXELS
-from gsmerge.method.compare.view_pictures import show_views
+from gsmerge.method.compare.offsets import CONTRAST_PIXELS, OFFSET_PIXELS
+from gsmerge.method.compare.similarity import find_contrast
+from gsmerge.method.compare.view_pictures import ViewPictures, show_views
 from gsmerge.method.geometry.views import pick_views
 from gsmerge.method.kernels.pictures import count_bars
-from gsmerge.reading.photos.grid_fit import WHOLE_FIT, GridFit, PartFit, choose_fit
+from gsmerge.method.raster.photos import shrink_pictures
+from gsmerge.reading.photos.grid_fit import WHOLE_FIT, GridFit, PartFit, choose_fit, clear_beyond
 from gsmerge.reading.photos.scene_photos import ScenePhotos
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Scene
@@ -84,14 +90,56 @@ def round_to_cameras(inner: Part, size: Size, shape: Size) -> Part:
     return left, top, left + sides[0] / size[0], top + sides[1] / size[1]
 
 
+def find_crop(show: Callable[[int], ViewPictures], photos: Sequence[np.ndarray], size: Size, shape: Size) -> PartFit:
+    """Find where photos lie in their views that were all cropped in the same way after the model saw them.
+
+    The contrast of photos is searched for in that of the views' pictures, at all places and scales at which photos lie
+    inside their views: first in small pictures, then in larger ones near the scale that was found. If it is nearly 1,
+    photos were not resized.
+
+    Args:
+        show: Function that makes pictures of the views with a number of pixels on the longer side.
+        photos: Photos ``[h,w,3]`` of the views, which may be smaller than their files.
+        size: Size of the files of the photos.
+        shape: Size of the views.
+    """
+
+    def place(views: Sequence[np.ndarray], spread: int, scale: float) -> tuple[float, float, float, float]:
+        """Return the correlation at the best place of photos at a scale, the scale, and the place: column and line."""
+        across, down = views[0].shape[1] / shape[0], views[0].shape[0] / shape[1]
+        width, height = round(size[0] * scale * across), round(size[1] * scale * down)
+        scores = np.zeros(1)
+        for view, photo in zip(views, photos, strict=True):
+            small = find_contrast(shrink_pictures(photo[None], width, height)[0], None, spread)
+            scores = scores + cv2.matchTemplate(view, small, cv2.TM_CCORR_NORMED)
+        line, column = np.unravel_index(scores.argmax(), scores.shape)
+        return float(scores.max()), scale, column / across, line / down
+
+    largest = min(shape[0] / size[0], shape[1] / size[1])  # pixels of a view for a pixel of a photo
+    scales = largest * (1 - 0.02 * np.arange(26))  # down to half of it
+    scale = left = top = 0.0
+    for side, step in ((OFFSET_PIXELS // 4, 0.02), (OFFSET_PIXELS, 0.005), (max(shape), 0.001)):
+        shown = show(side)
+        spread = CONTRAST_PIXELS * side // OFFSET_PIXELS
+        views = [find_contrast(*view, spread) for view in zip(shown.pictures, shown.weights, strict=True)]
+        _, scale, left, top = max(parallel_map(partial(place, views, spread), scales))
+        near = scale * (1 + step / 4 * np.arange(-6, 7))
+        scales = np.append(near[near < largest], largest) if near[-1] >= largest else near
+        if side == OFFSET_PIXELS and near[0] <= 1 <= near[-1]:
+            scales = np.ones(1)  # photos that were not resized
+    width, height = scale * size[0], scale * size[1]
+    return PartFit((-left / width, -top / height, (shape[0] - left) / width, (shape[1] - top) / height))
+
+
 def choose_part(
     scene: Scene, photos: ScenePhotos, camera_file: CameraFile, grid_fit: GridFit | None = None
 ) -> ScenePhotos | None:
     """Find the part of the proposed photos that shows the views, and return photos of which this part is used.
 
-    None if no part fits better than whole photos, or if even the best part does not look like the views
-    (:meth:`Assigner.explain_most`). None also if photos differ in shape or have orientation tags. ``grid_fit`` is how
-    whole photos were resized, if the cameras were estimated.
+    If parts of the views fit better than parts of the photos, photos are extended to their views, see
+    :func:`find_crop`. None if no part fits better than whole photos, or if even the best part does not look like the
+    views (:meth:`Assigner.explain_most`). None also if photos differ in shape or have orientation tags. ``grid_fit`` is
+    how whole photos were resized, if the cameras were estimated.
     """
     named = [(view, path) for view, path in enumerate(photos.named) if path is not None]
     max_compared = 8  # largest number of photos whose parts are compared with their views
@@ -120,11 +168,24 @@ def choose_part(
         fits: list[GridFit | PartFit] = [*list_parts(sizes[0], view_size, inner)]
     else:  # cameras were estimated, so parts may have any shape
         fits = [grid_fit, *list_parts(sizes[0], None, inner)]
-    fit = choose_fit(show_views(scene, OFFSET_PIXELS)[views], pictures, fits)
+
+    def show(part: Part, side: int) -> ViewPictures:
+        """Make pictures of the views, without what lies beyond a part of the photos."""
+        shown = show_views(scene, side)[views]
+        for weights in shown.weights:
+            clear_beyond(weights, part)
+        return shown
+
+    fit = choose_fit(show(WHOLE, OFFSET_PIXELS), pictures, fits)
+    if grid_fit is None:
+        crop = find_crop(partial(show, WHOLE), pictures, sizes[0], view_size)
+        left, top, right, bottom = crop.part
+        if (right - left) * (bottom - top) <= 2:  # photos of less than half of their views cannot be told from others
+            fit = choose_fit(show(crop.part, OFFSET_PIXELS), pictures, [fit, crop])
     if isinstance(fit, GridFit) or fit == WHOLE_FIT:
         return None
     candidates = Candidates(read=lambda photo: fit.cut(pictures[photo]), count=len(paths), tag=lambda _: 0)
-    assigner = Assigner(lambda side: show_views(scene, side)[views], candidates)
+    assigner = Assigner(partial(show, fit.part), candidates)
     is_right = assigner.explain_most([Assignment(photo, 0) for photo in range(len(paths))])
     note = fit.describe(sizes[0], bars=fit.part == inner != WHOLE)
     return replace(photos, fit=fit, notes=(*photos.notes, note)) if is_right else None

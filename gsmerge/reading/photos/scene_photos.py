@@ -480,6 +480,13 @@ def has_other_shape(photos: ScenePhotos, camera_file: CameraFile) -> bool:
     return not any(same_shape(shape, turned) for shape in shapes for turned in (size, size[::-1]))
 
 
+def have_fewer_pixels(photos: ScenePhotos, camera_file: CameraFile) -> bool:
+    """Return True if photos have fewer pixels than the cameras of their file, so that they may be crops."""
+    size = photos.file_size
+    is_stored = camera_file.source != ESTIMATED
+    return is_stored and size is not None and any(size < shape for shape in sizes_of(camera_file))
+
+
 def name_by_photos(camera_file: CameraFile, photos: ScenePhotos) -> CameraFile:
     """Name estimated cameras by the photos of their views, and adapt the cameras to the ``grid_fit`` of the photos.
 

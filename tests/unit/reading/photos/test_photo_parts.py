@@ -58,6 +58,35 @@ def test_a_part_that_fits_is_cut_out(tmp_path: Path, name: str) -> None:
     assert np.abs(images * 255 - SMOOTH.images).mean() < 6
 
 
+# Columns and lines that are cut off photos of 192 x 144 at the left, above, on the right and below, and a later scale
+CROPS = {
+    "right": ((0, 0, 20, 0), 1),
+    "all sides": ((12, 6, 8, 12), 1),
+    "in proportion": ((16, 12, 8, 6), 1),
+    "shrunk": ((0, 24, 0, 0), 0.75),
+}
+
+
+@pytest.mark.parametrize("name", CROPS)
+def test_photos_that_were_cropped_are_put_into_their_views(tmp_path: Path, name: str) -> None:
+    """What was cut off does not count, and rows stay pixels of the whole views."""
+    (left, top, right, bottom), scale = CROPS[name]
+    whole = smooth_scene(192, 144)
+    whole.save(tmp_path)
+    rest = np.s_[top : 144 - bottom, left : 192 - right]
+    for image_name, image in zip(whole.names, whole.images, strict=True):
+        crop = cv2.resize(image[rest], None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        assert cv2.imwrite(str(tmp_path / "images" / image_name), crop[..., ::-1])
+    loaded = load_scene(tmp_path)
+    scene = loaded.scene
+    assert noted(loaded.notes, f"column {round(left * scale)} and line {round(top * scale)} on", "crops of the views")
+    inner = np.s_[:, top + 2 : 142 - bottom, left + 2 : 190 - right]
+    assert scene.has_own_pixels
+    assert scene.masks[inner].all()
+    assert scene.masks.sum() == pytest.approx(len(scene) * whole.images[0][rest].size / 3, rel=0.05)
+    assert np.abs(scene.images[inner] * 255 - whole.images[inner]).mean() < (1 if scale == 1 else 4)
+
+
 @pytest.mark.slow
 def test_photos_of_which_no_part_fits_are_left_out(tmp_path: Path) -> None:
     write_photos(tmp_path, lambda i: np.hstack([other(i), other(i)]))
