@@ -90,18 +90,20 @@ def round_to_cameras(inner: Part, size: Size, shape: Size) -> Part:
     return left, top, left + sides[0] / size[0], top + sides[1] / size[1]
 
 
-def find_crop(show: Callable[[int], ViewPictures], photos: Sequence[np.ndarray], size: Size, shape: Size) -> PartFit:
+def find_crop(
+    show: Callable[[int], ViewPictures], photos: Sequence[np.ndarray], size: Size, shape: Size, *, resized: bool
+) -> PartFit:
     """Find where photos lie in their views that were all cropped in the same way after the model saw them.
 
     The contrast of photos is searched for in that of the views' pictures, at all places and scales at which photos lie
-    inside their views: first in small pictures, then in larger ones near the scale that was found. If it is nearly 1,
-    photos were not resized.
+    inside their views: first in small pictures, then in larger ones near the scale that was found.
 
     Args:
         show: Function that makes pictures of the views with a number of pixels on the longer side.
         photos: Photos ``[h,w,3]`` of the views, which may be smaller than their files.
         size: Size of the files of the photos.
         shape: Size of the views.
+        resized: Whether pixels of the photos may have another size than those of the views.
     """
 
     def place(views: Sequence[np.ndarray], spread: int, scale: float) -> tuple[float, float, float, float]:
@@ -116,17 +118,16 @@ def find_crop(show: Callable[[int], ViewPictures], photos: Sequence[np.ndarray],
         return float(scores.max()), scale, column / across, line / down
 
     largest = min(shape[0] / size[0], shape[1] / size[1])  # pixels of a view for a pixel of a photo
-    scales = largest * (1 - 0.02 * np.arange(26))  # down to half of it
+    scales = largest * (1 - 0.02 * np.arange(26)) if resized else np.ones(1)  # down to half of the largest
     scale = left = top = 0.0
     for side, step in ((OFFSET_PIXELS // 4, 0.02), (OFFSET_PIXELS, 0.005), (max(shape), 0.001)):
         shown = show(side)
         spread = CONTRAST_PIXELS * side // OFFSET_PIXELS
         views = [find_contrast(*view, spread) for view in zip(shown.pictures, shown.weights, strict=True)]
         _, scale, left, top = max(parallel_map(partial(place, views, spread), scales))
-        near = scale * (1 + step / 4 * np.arange(-6, 7))
-        scales = np.append(near[near < largest], largest) if near[-1] >= largest else near
-        if side == OFFSET_PIXELS and near[0] <= 1 <= near[-1]:
-            scales = np.ones(1)  # photos that were not resized
+        if resized:
+            near = scale * (1 + step / 4 * np.arange(-4, 5))
+            scales = np.append(near[near < largest], largest) if near[-1] >= largest else near
     width, height = scale * size[0], scale * size[1]
     return PartFit((-left / width, -top / height, (shape[0] - left) / width, (shape[1] - top) / height))
 
@@ -177,8 +178,9 @@ def choose_part(
         return shown
 
     fit = choose_fit(show(WHOLE, OFFSET_PIXELS), pictures, fits)
-    if grid_fit is None:
-        crop = find_crop(partial(show, WHOLE), pictures, sizes[0], view_size)
+    is_inside = max(np.divide(sizes[0], view_size)) <= 1
+    for resized in () if grid_fit else (False, True) if is_inside else (True,):  # resized crops have to fit better
+        crop = find_crop(partial(show, WHOLE), pictures, sizes[0], view_size, resized=resized)
         left, top, right, bottom = crop.part
         if (right - left) * (bottom - top) <= 2:  # photos of less than half of their views cannot be told from others
             fit = choose_fit(show(crop.part, OFFSET_PIXELS), pictures, [fit, crop])
