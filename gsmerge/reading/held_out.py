@@ -6,14 +6,14 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from gsmerge.errors import SceneError, attempt
+from gsmerge.errors import Doubt, SceneError, attempt
 from gsmerge.frozen import dataclass, replace
 from gsmerge.io.bounds import no_such_path
-from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, select_views, to_cameras, with_convention
+from gsmerge.io.cameras.camera_file import CameraFile, as_pinholes, select_views, sizes_of, to_cameras, with_convention
 from gsmerge.io.cameras.read_cameras import read_cameras
 from gsmerge.io.cameras.table import IN_SPLAT_FRAME
 from gsmerge.io.image_names import find_image
-from gsmerge.io.photo_files import as_floats, photo_size
+from gsmerge.io.photo_files import as_floats, photo_size, same_shape
 from gsmerge.method.geometry.transforms import IDENTITY, Similarity, camera_centres, fit_similarity
 from gsmerge.method.kernels.elementary import arccos
 from gsmerge.reading.exporters import NO_HINTS
@@ -94,6 +94,11 @@ def read_held_out(load: Loaded, cameras: StrPath, images: StrPath | None = None)
         )
     pinholes, photos, _ = as_pinholes(held_out, photos)
     photos, notes = limit_photo_size(photos, 0, NO_HINTS.max_side, unaligned=False)
+    size = photo_size(photos) or (1, 1)
+    for shape in sizes_of(pinholes):
+        if not same_shape(shape, size):
+            found = "the cameras of {} x {} are stretched to the held-out photos, {} x {}".format(*shape, *size)
+            notes.append(Doubt(f"{found}; if these were cropped, name the whole photos, or cameras of crops"))
     place_of_view = {view: place for place, view in shared.items()}
     has_all = 0 < len(place_of_view) == len(load.scene)
     return HeldOutViews(

@@ -131,6 +131,15 @@ def test_photos_of_another_size_bring_their_intrinsics(tiny: Tiny, load: Loaded,
     assert np.allclose(targets.cameras.Ks[0][:2], 2 * tiny.K[:2])
 
 
+def test_photos_of_another_shape_than_their_cameras_are_doubted(tiny: Tiny, load: Loaded, tmp_path: Path) -> None:
+    cameras = write_views(tmp_path / "held", {"q": between(tiny)}, tiny, (64, 48))
+    assert not read_held_out(load, cameras).notes
+    with edited_json(cameras) as document:
+        document["w"] = 80
+    (note,) = read_held_out(load, cameras).notes
+    assert "80 x 48 are stretched to the held-out photos, 64 x 48" in note
+
+
 def test_photos_of_targets_elsewhere_have_to_be_named(tiny: Tiny, load: Loaded, tmp_path: Path) -> None:
     cameras = write_views(tmp_path / "held", {"q": between(tiny)}, tiny)
     shutil.move(str(tmp_path / "held" / "images"), str(tmp_path / "photos"))
