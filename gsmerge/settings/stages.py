@@ -61,7 +61,7 @@ class SegmentOptions(Settings):
         "By default by effort: draft and fast 1, default 2, best 3.", least=1, unit="per superpixel")  # fmt: skip
     early_sweeps: int | None = setting(None, "Of `rdseg`: sweeps over border pixels before rectangles are merged.",
         "By default 0, with effort best 1.", least=0, most=1000)  # fmt: skip
-    compactness: float = setting(1e-5, "Of `rdseg`: weight of squared distances in pixels, relative "
+    compactness: float = setting(1e-5, "Of `rdseg`: weight of squared distances in pixels, relative"
         " to squared differences of colours in [0, 1].",
         "At 0 superpixels become long and winding, and no Gaussian fits them.", least=0, most=1)  # fmt: skip
 
