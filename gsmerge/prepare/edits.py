@@ -20,7 +20,7 @@ from gsmerge.method.geometry.transforms import camera_centres, camera_depths, pr
 from gsmerge.method.kernels.pictures import convolve
 from gsmerge.method.kernels.raster.project import view_colors
 from gsmerge.method.raster import render
-from gsmerge.method.raster.photos import COVERED_TRANSMITTANCE, counting_pixels
+from gsmerge.method.raster.photos import COVERED_TRANSMITTANCE, counting_pixels, pixel_weights
 from gsmerge.prepare.compare_photos import COMPARED_OPACITY
 from gsmerge.prepare.photo_change import KEEP, PhotoChange, change_large
 from gsmerge.runtime.threads import parallel_map
@@ -117,6 +117,7 @@ def _find_new_colors(scene: PicturedScene, rows: np.ndarray) -> np.ndarray:
     means = gaussians.means
     base_colors = sh0_to_rgb(gaussians.sh0[:, 0]).clip(0, 1).astype(np.float32)
     eyes = camera_centres(scene.cameras.viewmats)
+    inside = pixel_weights(scene.masks, width, height)
 
     def compare(view: int) -> np.ndarray:
         """Return the distance ``[m]`` of each colour from those around its place in a photo; inf for unseen ones."""
@@ -129,6 +130,7 @@ def _find_new_colors(scene: PicturedScene, rows: np.ndarray) -> np.ndarray:
             colors = colors.clip(0, 1)
         photo = cv2.resize(scene.images[view], (width, height), interpolation=cv2.INTER_AREA)
         seen, places, _ = _look_up(means, scene, view, width, height)
+        seen = seen if inside is None else seen & (inside[view].reshape(-1)[places] == 1)
         low = cv2.erode(photo, SQUARE_3).reshape(-1, 3)[places]
         high = cv2.dilate(photo, SQUARE_3).reshape(-1, 3)[places]
         beyond = np.maximum(low - colors, colors - high).clip(0)

@@ -182,6 +182,16 @@ def test_sound_scenes_stay(noise: float, own: bool) -> None:
     assert_unchanged(scene if own else replace(scene, pixels=None))
 
 
+def test_pixels_that_do_not_count_are_no_edit() -> None:
+    """Photos that were cropped are black beyond, which is the colour of no Gaussian there."""
+    scene = scenes.make_scene(scenes.room(), scenes.arc(VIEWS, WIDTH, HEIGHT))
+    masks = np.full(scene.images.shape[:3], True)
+    masks[:, : HEIGHT // 4] = False
+    cropped = replace(scene, images=scene.images * masks[..., None], masks=masks, pixels=None)
+    assert "edited" in follow_edits(replace(cropped, masks=None))[1]
+    assert_unchanged(cropped)
+
+
 def test_scenes_of_two_views_stay() -> None:
     assert_unchanged(insert_ball(solid([WALL], 2), solid([BALL, WALL], 2)))
 
