@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import product
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -27,6 +28,7 @@ from gsmerge.io.photo_files import (
     limit_size,
     orientation_turn,
     part_size,
+    reaches_beyond,
     resize_and_crop,
     resize_to,
     same_shape,
@@ -43,6 +45,7 @@ from gsmerge.reading.photos.scene_photos import ScenePhotos
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import Scene
 
+POINT_SCALE = np.float32(0.1)  # by which Gaussians are multiplied that are drawn as points
 BAR_SPREAD = 8  # largest difference of the colours within a bar, of 255
 _TILES = 4  # largest number of pictures in a row or a column of a photo
 _HALVES: tuple[Part, ...] = ((0, 0, 0.5, 1), (0.5, 0, 1, 1), (0, 0, 1, 0.5), (0, 0.5, 1, 1))
@@ -132,6 +135,27 @@ def find_crop(
     return PartFit((-left / width, -top / height, (shape[0] - left) / width, (shape[1] - top) / height))
 
 
+def read_small(paths: Sequence[Path], sizes: Sequence[Size]) -> tuple[list[np.ndarray], Part]:
+    """Read photos of ``sizes`` as small pictures, and find the part of a photo that is usually inside of bars.
+
+    A damaged photo is black.
+    """
+
+    def read(number: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return a small photo, and the shares of its sides (left, above, right, below) that are bars."""
+        size = sizes[number]
+        whole = attempt(decode_image, paths[number], size)
+        if isinstance(whole, SceneError):
+            return np.zeros((OFFSET_PIXELS, OFFSET_PIXELS, 3), np.float32), np.zeros(4)
+        above, below, left, right = count_bars(whole, BAR_SPREAD)
+        small = resize_to(size, limit_size(size, 4 * OFFSET_PIXELS)).photos([whole])[0]
+        return small / np.float32(255), np.array([left, above, right, below]) / (size * 2)
+
+    pictures, bars = zip(*parallel_map(read, range(len(paths))), strict=True)
+    left, above, right, below = np.median(bars, 0).tolist()
+    return list(pictures), (left, above, 1 - right, 1 - below)
+
+
 def choose_part(
     scene: Scene, photos: ScenePhotos, camera_file: CameraFile, grid_fit: GridFit | None = None
 ) -> ScenePhotos | None:
@@ -150,25 +174,18 @@ def choose_part(
     if not paths or shapes_differ or any(map(orientation_turn, paths)):
         return None
 
-    def read(number: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return a small photo, and the shares of its sides (left, above, right, below) that are bars."""
-        size = sizes[number]
-        whole = attempt(decode_image, paths[number], size)
-        if isinstance(whole, SceneError):
-            return np.zeros((OFFSET_PIXELS, OFFSET_PIXELS, 3), np.float32), np.zeros(4)
-        above, below, left, right = count_bars(whole, BAR_SPREAD)
-        small = resize_to(size, limit_size(size, 4 * OFFSET_PIXELS)).photos([whole])[0]
-        return small / np.float32(255), np.array([left, above, right, below]) / (size * 2)
-
-    pictures, bars = zip(*parallel_map(read, range(len(paths))), strict=True)
-    left, above, right, below = np.median(bars, 0).tolist()
-    inner = left, above, 1 - right, 1 - below  # the part inside of bars
+    pictures, inner = read_small(paths, sizes)
     view_size = next(iter(sizes_of(camera_file)), (scene.cameras.width, scene.cameras.height))
     if grid_fit is None:
         inner = round_to_cameras(inner, sizes[0], view_size)
         fits: list[GridFit | PartFit] = [*list_parts(sizes[0], view_size, inner)]
     else:  # cameras were estimated, so parts may have any shape
         fits = [grid_fit, *list_parts(sizes[0], None, inner)]
+
+    points = scene
+    if not scene.has_own_pixels:  # Gaussians hide what is behind them, which moves slanted surfaces; points hardly do
+        gaussians = scene.gaussians
+        points = replace(scene, gaussians=replace(gaussians, scales=POINT_SCALE * gaussians.scales))
 
     def show(part: Part, side: int) -> ViewPictures:
         """Make pictures of the views, without what lies beyond a part of the photos."""
@@ -177,17 +194,28 @@ def choose_part(
             clear_beyond(weights, part)
         return shown
 
+    def show_inside(part: Part, side: int) -> ViewPictures:
+        """Make pictures of what a part of the photos shows of the views, cut to the photos."""
+        shown = show(part, side)
+        lines, columns = (np.flatnonzero(shown.weights.any((0, axis))) for axis in (2, 1))
+        box = np.s_[:, lines[0] : lines[-1] + 1, columns[0] : columns[-1] + 1]
+        return replace(shown, pictures=shown.pictures[box], weights=shown.weights[box])
+
     fit = choose_fit(show(WHOLE, OFFSET_PIXELS), pictures, fits)
     is_inside = max(np.divide(sizes[0], view_size)) <= 1
     for resized in () if grid_fit else (False, True) if is_inside else (True,):  # resized crops have to fit better
-        crop = find_crop(partial(show, WHOLE), pictures, sizes[0], view_size, resized=resized)
+        crop = find_crop(lambda side: show_views(points, side)[views], pictures, sizes[0], view_size, resized=resized)
         left, top, right, bottom = crop.part
         if (right - left) * (bottom - top) <= 2:  # photos of less than half of their views cannot be told from others
             fit = choose_fit(show(crop.part, OFFSET_PIXELS), pictures, [fit, crop])
     if isinstance(fit, GridFit) or fit == WHOLE_FIT:
         return None
-    candidates = Candidates(read=lambda photo: fit.cut(pictures[photo]), count=len(paths), tag=lambda _: 0)
-    assigner = Assigner(partial(show, fit.part), candidates)
+    # photos that are extended are compared without what was added
+    is_crop = reaches_beyond(fit.part)
+    candidates = Candidates(
+        lambda photo: pictures[photo] if is_crop else fit.cut(pictures[photo]), len(paths), lambda _: 0
+    )
+    assigner = Assigner(partial(show_inside if is_crop else show, fit.part), candidates)
     is_right = assigner.explain_most([Assignment(photo, 0) for photo in range(len(paths))])
     note = fit.describe(sizes[0], bars=fit.part == inner != WHOLE)
     return replace(photos, fit=fit, notes=(*photos.notes, note)) if is_right else None

@@ -64,6 +64,7 @@ CROPS = {
     "all sides": ((12, 6, 8, 12), 1),
     "in proportion": ((16, 12, 8, 6), 1),
     "shrunk": ((0, 24, 0, 0), 0.75),
+    "to three fifths": ((28, 8, 10, 28), 1),
 }
 
 
