@@ -315,7 +315,7 @@ def check_masks(masks: Masks, files: SceneFiles, scene: Scene) -> tuple[Masks, s
         return NO_MASKS, reason, [Doubt(f"masks are not used: {where}: they {reason}; {remedy}")]
     count = int((~counts.all((1, 2))).sum())
     kind = "transparency, masks or crops" if files.masks is None else "masks"
-    return masks, reason, [f"{kind} {reason}; {count} of {len(counts)} photos have a mask"]
+    return masks, reason, [f"{kind} {reason}, in {count} of {len(counts)} photos"]
 
 
 def _share_of_gaussians(scene: Scene, counts: np.ndarray) -> float:

@@ -50,7 +50,7 @@ def test_masks_beside_the_photos_are_found_by_their_names(
     load = load_scene(tiny_folder)
     assert np.array_equal(load.scene.masks[1], half(tiny))
     assert load.scene.masks[[0, 2]].all()  # they have none
-    assert "masks leave out 17 % of the photos' pixels; 1 of 3 photos have a mask" in load.notes
+    assert "masks leave out 17 % of the photos' pixels, in 1 of 3 photos" in load.notes
 
 
 def test_masks_in_a_folder_belong_to_the_photos_in_the_folder_of_its_name(tmp_path: Path) -> None:

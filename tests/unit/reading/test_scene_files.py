@@ -443,7 +443,7 @@ def mask_paths(folder: Path, paths: Sequence[object], *, size: tuple[int, int] =
 @pytest.mark.parametrize(
     ("paths", "changes", "shares", "said"),
     [
-        (["cut/0.png", "./cut/1", "cut/2.png"], {}, [0.25] * 3, ("3 of 3 photos have a mask",)),
+        (["cut/0.png", "./cut/1", "cut/2.png"], {}, [0.25] * 3, ("in 3 of 3 photos",)),
         (["cut/0.png"], {}, [0.25, 0, 0], ("1 of 3 photos",)),
         (["cut/0.png", "gone/1.png"], {}, [0.25, 0, 0], ("1 of 3 masks", "transforms.json", "gone/1.png", "--masks")),
         ([], {"shared": "cut/0.png"}, [0.25] * 3, ("3 of 3 photos",)),
