@@ -45,6 +45,7 @@ OFTEN = (
     "transforms.json: a photo's path that is a device",
     "transforms.json: a camera_model of 3 MB for 10,000 frames with poses",
     "COLMAP binary: an image with 18446744073709551615 points",
+    "COLMAP binary: a camera 60000 pixels wide",
     "views.npz: poses as objects that would run code", "results.npz: zeros as photos of 1400 x 1400 floats",
     "photos: a PNG that claims 60000 x 60000",
     "scene: a folder named with line breaks", "scene: scene.ply as a pipe", "scene: images as a link to itself",

@@ -47,6 +47,7 @@ from gsmerge.types import Scene
 
 POINT_SCALE = np.float32(0.1)  # by which Gaussians are multiplied that are drawn as points
 BAR_SPREAD = 8  # largest difference of the colours within a bar, of 255
+_READ_PIXELS = 4 * OFFSET_PIXELS  # longer side of the photos that are compared
 _TILES = 4  # largest number of pictures in a row or a column of a photo
 _HALVES: tuple[Part, ...] = ((0, 0, 0.5, 1), (0.5, 0, 1, 1), (0, 0, 1, 0.5), (0, 0.5, 1, 1))
 
@@ -112,7 +113,7 @@ def find_crop(
     def place(views: Sequence[np.ndarray], spread: int, scale: float) -> tuple[float, float, float, float]:
         """Return the correlation at the best place of photos at a scale, the scale, and the place: column and line."""
         across, down = views[0].shape[1] / shape[0], views[0].shape[0] / shape[1]
-        width, height = round(size[0] * scale * across), round(size[1] * scale * down)
+        width, height = max(1, round(size[0] * scale * across)), max(1, round(size[1] * scale * down))
         scores = np.zeros(1)
         for view, photo in zip(views, photos, strict=True):
             small = find_contrast(shrink_pictures(photo[None], width, height)[0], None, spread)
@@ -123,7 +124,8 @@ def find_crop(
     largest = min(shape[0] / size[0], shape[1] / size[1])  # pixels of a view for a pixel of a photo
     scales = largest * (1 - 0.02 * np.arange(26)) if resized else np.ones(1)  # down to half of the largest
     scale = left = top = 0.0
-    for side, step in ((OFFSET_PIXELS // 4, 0.02), (OFFSET_PIXELS, 0.005), (max(shape), 0.001)):
+    finest = min(max(shape), 2 * _READ_PIXELS)  # photos of half of their views have pixels as large as these
+    for side, step in ((OFFSET_PIXELS // 4, 0.02), (OFFSET_PIXELS, 0.005), (finest, 0.001)):
         shown = show(side)
         spread = CONTRAST_PIXELS * side // OFFSET_PIXELS
         views = [find_contrast(*view, spread) for view in zip(shown.pictures, shown.weights, strict=True)]
@@ -148,7 +150,7 @@ def read_small(paths: Sequence[Path], sizes: Sequence[Size]) -> tuple[list[np.nd
         if isinstance(whole, SceneError):
             return np.zeros((OFFSET_PIXELS, OFFSET_PIXELS, 3), np.float32), np.zeros(4)
         above, below, left, right = count_bars(whole, BAR_SPREAD)
-        small = resize_to(size, limit_size(size, 4 * OFFSET_PIXELS)).photos([whole])[0]
+        small = resize_to(size, limit_size(size, _READ_PIXELS)).photos([whole])[0]
         return small / np.float32(255), np.array([left, above, right, below]) / (size * 2)
 
     pictures, bars = zip(*parallel_map(read, range(len(paths))), strict=True)
