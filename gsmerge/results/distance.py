@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from gsmerge.io.photo_files import limit_size
 from gsmerge.method.facts.prepared import Prepared
 from gsmerge.method.fit.outside import outside_cameras, sample_gaussians
 from gsmerge.method.geometry.views import even_views, resize_cameras
@@ -53,8 +54,7 @@ def describe_clear_loss(gaussians: Gaussians, prepared: Prepared) -> str | None:
     scene = prepared.scene
     views = prepared.reference.score_views
     photo_views = [views[i] for i in even_views(len(views), min(len(views), MOST_PHOTOS))]
-    share = DISTANCE_PIXELS / max(DISTANCE_PIXELS, scene.cameras.width, scene.cameras.height)
-    size = [max(1, round(side * share)) for side in (scene.cameras.width, scene.cameras.height)]
+    size = limit_size((scene.cameras.width, scene.cameras.height), DISTANCE_PIXELS)
     sample = sample_gaussians(scene, DISTANCE_GAUSSIANS)
     cameras = resize_cameras(scene.cameras, *size)
     between = between_cameras(cameras[list(views)]) if len(views) > 1 else cameras[[]]

@@ -11,6 +11,7 @@ from gsmerge.errors import Doubt
 from gsmerge.frozen import replace
 from gsmerge.io.formats.table import FILES, Format, Held, output_format
 from gsmerge.io.formats.write import output_notes
+from gsmerge.io.photo_files import limit_size
 from gsmerge.method.geometry.views import even_views, resize_cameras
 from gsmerge.method.raster import render
 from gsmerge.method.raster.metrics import decibels
@@ -85,8 +86,7 @@ def _compare_pictures(gaussians: Gaussians, values: Mapping[str, Held], cameras:
     """Return the PSNR (dB) between pictures of Gaussians, and of these with the nearest ``values`` that are held."""
     cameras = cameras.numpy() if len(cameras) else place_viewpoints(gaussians)
     cameras = cameras[even_views(len(cameras), min(len(cameras), MOST_PICTURES))]
-    share = min(1.0, LONGER_SIDE / max(cameras.width, cameras.height))
-    cameras = resize_cameras(cameras, max(1, round(share * cameras.width)), max(1, round(share * cameras.height)))
+    cameras = resize_cameras(cameras, *limit_size((cameras.width, cameras.height), LONGER_SIDE))
     clipped = {
         name: np.clip(getattr(gaussians, name), np.float32(held.low), np.float32(held.high))
         for name, held in values.items()

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from gsmerge.frozen import dataclass, fields, replace
+from gsmerge.io.photo_files import limit_size
 from gsmerge.method.geometry.transforms import camera_depths, lower_median
 from gsmerge.method.kernels.matrices import invert, matmul
 from gsmerge.method.raster.photos import row_pictures
@@ -97,10 +98,9 @@ def _read_picture(scene: Scene, view: int, K: np.ndarray) -> tuple[np.ndarray, n
     if scene.large_photos is not None:
         large = scene.large_photos
         photo = large.read(large.ids[view])
-        share = min(1.0, KEYPOINT_PIXELS / max(large.width, large.height))
-        size = max(1, round(large.width * share)), max(1, round(large.height * share))
+        size = limit_size((large.width, large.height), KEYPOINT_PIXELS)
         scale = np.array([[size[0] / large.width], [size[1] / large.height], [1.0]])
-        small = cv2.resize(photo, size, interpolation=cv2.INTER_AREA) if share < 1 else photo
+        small = cv2.resize(photo, size, interpolation=cv2.INTER_AREA) if size[0] < large.width else photo
         return small, large.Ks[view].astype(np.float64) * scale
     return to_bytes(row_pictures(scene)[view] if scene.images is None else scene.images[view]), K
 

@@ -14,6 +14,7 @@ from itertools import chain
 import cv2
 import numpy as np
 
+from gsmerge.io.photo_files import limit_size
 from gsmerge.method.geometry.transforms import Similarity, median, medians, motion_matrices, normalize, sh0_to_rgb
 from gsmerge.method.geometry.views import even_views, resize_cameras
 from gsmerge.method.kernels.elementary import exp, log
@@ -114,8 +115,7 @@ def mirror(inputs: AlignmentInput) -> AlignmentInput:
 def _make_small(inputs: AlignmentInput, views: Sequence[int]) -> tuple[Cameras, np.ndarray]:
     """Return the cameras and photos ``[v,h,w,3]`` uint8 of ``views``, at the size at which keypoints are searched."""
     cameras = inputs.cameras[list(views)]
-    share = min(1.0, DRAWN_PIXELS / max(cameras.width, cameras.height))
-    size = max(1, round(share * cameras.width)), max(1, round(share * cameras.height))
+    size = limit_size((cameras.width, cameras.height), DRAWN_PIXELS)
     images = [cv2.resize(to_bytes(inputs.images[view]), size, interpolation=cv2.INTER_AREA) for view in views]
     return resize_cameras(cameras, *size), np.stack(images)
 
