@@ -160,11 +160,14 @@ def _try_photos(
 ) -> PhotoTrial:
     """Make a scene with proposed photos, or if these cannot be used, without; let its views decide on their photos.
 
-    Raises SceneError if neither can be made.
+    Photos whose shape their cameras do not have are not tried if Gaussians lie in the pixels of these cameras. Raises
+    SceneError if neither can be made.
     """
     base = None
     error = None
-    if any(photos.named) and not is_without_names(camera_file):
+    has_shape = any(camera_file.lenses) or not has_other_shape(photos, camera_file, as_named=True)
+    is_proposed = any(photos.named) and not is_without_names(camera_file)
+    if is_proposed and (has_shape or not measure_bare(camera_file).are_pixels):
         base = measure(camera_file, photos)
         error = base.error
     are_read = base is not None and error is None

@@ -466,9 +466,10 @@ def _fit_to_grid(scene: Scene, photos: ScenePhotos) -> GridFit:
     return choose_fit(shown, chosen, fits) if any(picture is not None for picture in chosen) else fits[0]
 
 
-def has_other_shape(photos: ScenePhotos, camera_file: CameraFile) -> bool:
+def has_other_shape(photos: ScenePhotos, camera_file: CameraFile, *, as_named: bool = False) -> bool:
     """Return True if the first proposed photo, upright or turned, has another aspect ratio than all cameras.
 
+    With ``as_named``, photos that lie on their side, and are not turned, have another aspect ratio, too.
     Another aspect ratio is expected if the cameras' source is known to resize or crop photos; the result is False then.
     """
     first = next(filter(None, photos.named), None)
@@ -477,7 +478,8 @@ def has_other_shape(photos: ScenePhotos, camera_file: CameraFile) -> bool:
     if first is None or not shapes or is_known:
         return False
     size = photos.fit.stretch(part_size(image_size(first), photos.fit.part))
-    return not any(same_shape(shape, turned) for shape in shapes for turned in (size, size[::-1]))
+    turned = (size,) if as_named else (size, size[::-1])
+    return not any(same_shape(shape, one) for shape in shapes for one in turned)
 
 
 def have_fewer_pixels(photos: ScenePhotos, camera_file: CameraFile) -> bool:

@@ -17,6 +17,7 @@ from shared import write_scene
 from sweeps import sweep
 
 from gsmerge.errors import SceneError
+from gsmerge.reading.alignment import unaligned
 from gsmerge.reading.read_scene import Loaded, load_scene
 
 VIEWS, WIDTH, HEIGHT = 4, 128, 96
@@ -92,6 +93,19 @@ def test_photos_that_lie_on_their_side_are_turned(folder: Path, truth: np.ndarra
         Image.fromarray(np.ascontiguousarray(lying)).save(path, exif=exif)
     loaded = load_with_right_photos(folder, truth)
     assert any("are turned" in text and "3 of 4 photos" in text for text in loaded.notes) is not tagged
+
+
+def test_no_cameras_are_searched_for_photos_that_all_lie_on_their_side(
+    folder: Path, truth: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The Gaussians lie in the pixels of the cameras as these are."""
+    exif = Image.Exif()
+    exif[0x0112] = TAGS[1]
+    for path in photos_in(folder):
+        lying = np.rot90((read(path) * 255).round().astype(np.uint8), -1)
+        Image.fromarray(np.ascontiguousarray(lying)).save(path, exif=exif)
+    monkeypatch.setattr(unaligned, "find_frame", None)
+    assert not load_with_right_photos(folder, truth).notes
 
 
 def test_mirrored_photos_are_mirrored_back(folder: Path, truth: np.ndarray) -> None:
