@@ -104,7 +104,7 @@ def draw_left_out(scene: PicturedScene, masks: np.ndarray | None) -> PicturedSce
         colors[view] = image.clip(0, 1)
         bare[view] = transmittance[view] > COVERED_TRANSMITTANCE
 
-    tile_views(scene, draw, drawn, parts)
+    tile_views(scene.gaussians, scene.cameras, draw, drawn, parts)
     solid = ~find_bare(scene) if own else np.zeros_like(bare)
     if scene.beyond is not None:  # nothing is known there
         bare &= ~scene.beyond

@@ -8,6 +8,8 @@ view's farthest surface: the one at which the pictures of the nearest other view
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import cv2
 import numpy as np
 
@@ -20,7 +22,7 @@ from gsmerge.method.kernels.pictures import blur
 from gsmerge.method.kernels.reproject import add_differences
 from gsmerge.method.raster import TiledView
 from gsmerge.method.raster.composite import blend_depths, find_covered
-from gsmerge.method.raster.images import tile_views, tiles_near
+from gsmerge.method.raster.images import thin_out, tile_views, tiles_near
 from gsmerge.prepare.photo_change import PhotoChange, change_large
 from gsmerge.runtime.record import list_some, note
 from gsmerge.runtime.threads import parallel_map
@@ -47,6 +49,7 @@ FARTHEST_QUANTILE = 0.99  # quantile of the depths that counts as the farthest
 HOLE_NEIGHBORS = 3  # number of nearest views that a picture is compared with
 DIFFERENCE_BLUR = 3.0  # standard deviation in pixels of the window over which differences are averaged
 SAMPLE = 10_000  # pixels of a view that are enough for medians of depths; few Gaussians are all used
+DRAWN_OF = 4  # Gaussians of which one is drawn, enlarged, to find out whether a pixel whose depth is known is covered
 BARE = 0.02  # opacity up to which the Gaussian of a pixel shows nothing
 
 
@@ -119,18 +122,11 @@ def _find_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool) ->
     knows = scene.has_own_pixels & ~has_empty & (fillable.mean((1, 2)) < MOST_EMPTY)
     parts = {view: tiles_near(fillable[view], around) for view in views if knows[view]}
     num_own = np.count_nonzero(fronts >= 0, axis=(1, 2))
+    known_views = _find_known(scene, parts, fillable, holes, edges)
+    bare[known_views] = holes[known_views]
 
     def find_holes(view: int, tiled: TiledView) -> None:
         """Mark a view's pixels that stay empty, other pixels that its drawing does not cover, and holes to fill."""
-        pixels, own_depths = _sample_own(scene, view)
-        is_whole = view in parts and 2 * num_own[view] >= fronts[view].size
-        known = _fit_map(scene, view, pixels, own_depths) if is_whole else None
-        if known is not None and np.isfinite(known[fillable[view]]).all():  # no hole needs the depth beside it
-            holes[view] = bare[view] = fillable[view] & ~find_covered(tiled, 1 - HOLE_OPACITY)
-            if holes[view].any():
-                (farthest,) = quantiles(own_depths, [FARTHEST_QUANTILE])
-                edges[view] = _Edges(known[holes[view]], float(farthest), known[holes[view]])
-            return
         depths, transmittance = blend_depths(tiled)
         covered = transmittance <= 1 - HOLE_OPACITY
         if view in parts:
@@ -146,19 +142,55 @@ def _find_holes(scene: PicturedScene, shown: np.ndarray, *, everywhere: bool) ->
             window = np.ones((gap, gap), np.uint8)
             holes[view] &= cv2.morphologyEx(covered.astype(np.uint8), cv2.MORPH_CLOSE, window) > 0
         if covered.any() and holes[view].any():
+            pixels, own_depths = _sample_own(scene, view)
             beside = fill_gaps(depths[..., None], covered)[..., 0]
             if 2 * num_own[view] < np.count_nonzero(covered):  # the view has lost its rows, and other views know more
                 pixels = np.flatnonzero(covered)
                 pixels = pixels[:: 1 + len(pixels) // SAMPLE]
                 own_depths = depths.reshape(-1)[pixels].astype(np.float64)
-            if not is_whole:
-                known = _fit_map(scene, view, pixels, own_depths)
+            known = _fit_map(scene, view, pixels, own_depths)
             surfaces = own_depths if view in parts and own_depths.size else depths[covered]
             (farthest,) = quantiles(surfaces, [FARTHEST_QUANTILE])
             edges[view] = _Edges(beside[holes[view]], float(farthest), None if known is None else known[holes[view]])
 
-    tile_views(scene, find_holes, views, parts)
+    tile_views(scene.gaussians, scene.cameras, find_holes, sorted({*views} - {*known_views}), parts)
     return _Holes(views, bare, holes, empty, edges)
+
+
+def _find_known(
+    scene: PicturedScene,
+    parts: Mapping[int, np.ndarray],
+    fillable: np.ndarray,
+    holes: np.ndarray,
+    edges: dict[int, _Edges],
+) -> list[int]:
+    """Find the holes of views whose depth maps know the depths of all pixels that may be filled; return these views.
+
+    As no depth beside a hole counts, a sample of the Gaussians is drawn, and only the tiles ``parts`` of a view.
+    ``fillable [v,h,w]`` marks pixels that may be filled. The result is written to ``holes [v,h,w]`` and ``edges``.
+    """
+    fronts = scene.get_pixels().fronts
+    known = dict[int, tuple[np.ndarray, float]]()  # depths of a view's pixels that may be filled, and the farthest
+    for view in parts:
+        pixels, own_depths = _sample_own(scene, view)
+        depths = _fit_map(scene, view, pixels, own_depths)
+        if depths is None or 2 * np.count_nonzero(fronts[view] >= 0) < fronts[view].size:
+            continue
+        (farthest,) = quantiles(own_depths, [FARTHEST_QUANTILE])
+        if np.isfinite(depths[fillable[view]]).all():
+            known[view] = depths[fillable[view]], float(farthest)
+
+    def find_holes(view: int, tiled: TiledView) -> None:
+        """Mark the pixels of a view that the sample does not cover, with their depths."""
+        is_hole = ~find_covered(tiled, 1 - HOLE_OPACITY)[fillable[view]]
+        holes[view, fillable[view]] = is_hole
+        if is_hole.any():
+            depths, farthest = known[view]
+            edges[view] = _Edges(depths[is_hole], farthest, depths[is_hole])
+
+    sample = thin_out(scene.gaussians, len(scene.gaussians) // DRAWN_OF)
+    tile_views(sample, scene.cameras, find_holes, list(known), parts)
+    return list(known)
 
 
 def fill_pixels(scene: PicturedScene, added: Gaussians, empty_pixels: np.ndarray) -> PicturedScene:

@@ -122,7 +122,7 @@ def find_covered(scene: Scene) -> np.ndarray | None:
         is_covered[0] = False
         covered[view] = is_covered[labels]
 
-    tile_views(scene, cover, np.flatnonzero(hidden.any((1, 2))).tolist())
+    tile_views(scene.gaussians, scene.cameras, cover, np.flatnonzero(hidden.any((1, 2))).tolist())
     return covered if covered.any() else None
 
 

@@ -16,7 +16,7 @@ from gsmerge.method.raster.composite import Rendering, background_color, blend, 
 from gsmerge.method.raster.photos import NEAR_PLANE
 from gsmerge.method.raster.tiled_view import FAR_PLANE, Splats, TiledView, tile_view
 from gsmerge.runtime.threads import parallel_map
-from gsmerge.types import Cameras, Gaussians, Scene
+from gsmerge.types import Cameras, Gaussians
 
 # Scenes of more than ONE_AT_A_TIME Gaussians are tiled view by view, because a tiled view takes about as much memory as
 # the Gaussians
@@ -134,7 +134,8 @@ def tile_camera(
 
 
 def tile_views(
-    scene: Scene,
+    gaussians: Gaussians,
+    cameras: Cameras,
     use: Callable[[int, TiledView], None],
     views: Sequence[int] | None = None,
     tiles: Mapping[int, np.ndarray] | None = None,
@@ -143,13 +144,13 @@ def tile_views(
 
     ``tiles`` has masks of the tiles that have to be complete, see :func:`tile_view`; views without one are complete.
     """
-    splats, *_ = prepare_views(scene.gaussians, scene.cameras)
+    splats, *_ = prepare_views(gaussians, cameras)
 
     def tile_and_use(view: int) -> None:
         """Tile one view, and call ``use`` for it."""
-        use(view, tile_camera(splats, scene.cameras, view, tiles=None if tiles is None else tiles.get(view)))
+        use(view, tile_camera(splats, cameras, view, tiles=None if tiles is None else tiles.get(view)))
 
-    view_ids = range(len(scene)) if views is None else views
+    view_ids = range(len(cameras)) if views is None else views
     if len(splats) <= ONE_AT_A_TIME:
         parallel_map(tile_and_use, view_ids)
         return

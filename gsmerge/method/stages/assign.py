@@ -66,7 +66,7 @@ def find_owners(scene: Scene, groups: Groups) -> Owners:
             ids = tiled.ids[is_better]
             best.values[ids], best.views[ids], best.labels[ids] = values[is_better], view, labels[is_better]
 
-    tile_views(scene, update_best)
+    tile_views(scene.gaussians, scene.cameras, update_best)
     return best
 
 

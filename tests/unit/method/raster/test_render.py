@@ -21,7 +21,7 @@ from gsmerge.method.raster import (
     tile_view,
 )
 from gsmerge.method.raster.images import tile_views, tiles_near
-from gsmerge.types import SH_C0, make_scene
+from gsmerge.types import SH_C0
 
 FOCAL = 100.0
 
@@ -239,7 +239,7 @@ def test_tiles_near_pixels_are_drawn_as_in_the_whole_picture() -> None:
     def draw(view: int, tiled: TiledView) -> None:
         drawn[view] = composite(tiled)[0]
 
-    tile_views(make_scene(gaussians, cameras), draw, tiles={1: tiles})
+    tile_views(gaussians, cameras, draw, tiles={1: tiles})
     np.testing.assert_array_equal(drawn[0], whole.images[0])
     part = tiles.repeat(16, 0)[:70].repeat(16, 1)[:, :90]
     assert part.sum() == 9 * 16 * 16
