@@ -203,9 +203,9 @@ def _examine_photos(
     trial = _try_photos(measure, measure_bare, camera_file, part or photos)  # 2.
     if part is None and not shapes_differ:  # 3.
         shows_most = trial.checked.explain_most and not has_bars(trial.base.scene.images)
-        shows_most = shows_most and not have_fewer_pixels(trial.checked, camera_file)  # perhaps crops
-        fit = trial.checked.grid_fit
-        part = None if shows_most else choose_part(trial.base.scene, trial.proposed, camera_file, fit)
+        if not shows_most or have_fewer_pixels(trial.checked, camera_file):  # perhaps crops
+            fit = trial.checked.grid_fit
+            part = choose_part(trial.base.scene, trial.proposed, camera_file, fit, explain_most=shows_most)
         trial = trial if part is None else _try_photos(measure, measure_bare, camera_file, part)
     checked = trial.checked
     evidence = trial.base

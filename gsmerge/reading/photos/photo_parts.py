@@ -7,6 +7,7 @@ after the model saw them show a part of their views, and are put in its place.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import product
@@ -124,8 +125,10 @@ def find_crop(
     largest = min(shape[0] / size[0], shape[1] / size[1])  # pixels of a view for a pixel of a photo
     scales = largest * (1 - 0.02 * np.arange(26)) if resized else np.ones(1)  # down to half of the largest
     scale = left = top = 0.0
-    finest = min(max(shape), 2 * _READ_PIXELS)  # photos of half of their views have pixels as large as these
+    finest = min(max(shape), 2 * max(photos[0].shape))  # photos of half of their views have pixels as large as these
     for side, step in ((OFFSET_PIXELS // 4, 0.02), (OFFSET_PIXELS, 0.005), (finest, 0.001)):
+        if side == finest and scale == largest and same_shape(size, shape):  # photos show their whole views
+            break
         shown = show(side)
         spread = CONTRAST_PIXELS * side // OFFSET_PIXELS
         views = [find_contrast(*view, spread) for view in zip(shown.pictures, shown.weights, strict=True)]
@@ -159,14 +162,20 @@ def read_small(paths: Sequence[Path], sizes: Sequence[Size]) -> tuple[list[np.nd
 
 
 def choose_part(
-    scene: Scene, photos: ScenePhotos, camera_file: CameraFile, grid_fit: GridFit | None = None
+    scene: Scene,
+    photos: ScenePhotos,
+    camera_file: CameraFile,
+    grid_fit: GridFit | None = None,
+    *,
+    explain_most: bool = False,
 ) -> ScenePhotos | None:
     """Find the part of the proposed photos that shows the views, and return photos of which this part is used.
 
     If parts of the views fit better than parts of the photos, photos are extended to their views, see
     :func:`find_crop`. None if no part fits better than whole photos, or if even the best part does not look like the
     views (:meth:`Assigner.explain_most`). None also if photos differ in shape or have orientation tags. ``grid_fit`` is
-    how whole photos were resized, if the cameras were estimated.
+    how whole photos were resized, if the cameras were estimated. If whole photos ``explain_most`` views, they are
+    compared with crops alone.
     """
     named = [(view, path) for view, path in enumerate(photos.named) if path is not None]
     max_compared = 8  # largest number of photos whose parts are compared with their views
@@ -178,9 +187,12 @@ def choose_part(
 
     pictures, inner = read_small(paths, sizes)
     view_size = next(iter(sizes_of(camera_file)), (scene.cameras.width, scene.cameras.height))
-    if grid_fit is None:
+    fits: list[GridFit | PartFit]
+    if explain_most and grid_fit is None:
+        fits = [WHOLE_FIT]
+    elif grid_fit is None:
         inner = round_to_cameras(inner, sizes[0], view_size)
-        fits: list[GridFit | PartFit] = [*list_parts(sizes[0], view_size, inner)]
+        fits = [*list_parts(sizes[0], view_size, inner)]
     else:  # cameras were estimated, so parts may have any shape
         fits = [grid_fit, *list_parts(sizes[0], None, inner)]
 
@@ -204,7 +216,7 @@ def choose_part(
         return replace(shown, pictures=shown.pictures[box], weights=shown.weights[box])
 
     fit = choose_fit(show(WHOLE, OFFSET_PIXELS), pictures, fits)
-    is_inside = max(np.divide(sizes[0], view_size)) <= 1
+    is_inside = max(np.divide(sizes[0], view_size)) <= 1 and 2 * math.prod(sizes[0]) >= math.prod(view_size)
     for resized in () if grid_fit else (False, True) if is_inside else (True,):  # resized crops have to fit better
         crop = find_crop(lambda side: show_views(points, side)[views], pictures, sizes[0], view_size, resized=resized)
         left, top, right, bottom = crop.part

@@ -16,6 +16,7 @@ from messages import noted
 
 from gsmerge.io.photo_files import cut_part, part_size, reaches_beyond
 from gsmerge.method.geometry.transforms import sh0_to_rgb
+from gsmerge.reading.photos import photo_parts
 from gsmerge.reading.photos.grid_fit import PartFit, clear_beyond
 from gsmerge.reading.photos.photo_parts import list_parts
 from gsmerge.reading.read_scene import load_scene
@@ -86,6 +87,22 @@ def test_photos_that_were_cropped_are_put_into_their_views(tmp_path: Path, name:
     assert scene.masks[inner].all()
     assert scene.masks.sum() == pytest.approx(len(scene) * whole.images[0][rest].size / 3, rel=0.05)
     assert np.abs(scene.images[inner] * 255 - whole.images[inner]).mean() < (1 if scale == 1 else 4)
+
+
+def test_smaller_photos_of_whole_views_are_compared_with_crops_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As beside cameras of the photos' full size."""
+    whole = smooth_scene(192, 144)
+    whole.save(tmp_path)
+    for name, image in zip(whole.names, whole.images, strict=True):
+        small = cv2.resize(image, (144, 108), interpolation=cv2.INTER_AREA)
+        assert cv2.imwrite(str(tmp_path / "images" / name), small[..., ::-1])
+    monkeypatch.setattr(photo_parts, "list_parts", None)
+    loaded = load_scene(tmp_path)
+    assert loaded.scene.masks is None
+    assert len(loaded.scene.photo_views) == len(whole.images)
+    assert not noted(loaded.notes, "crops of the views")
 
 
 @pytest.mark.slow
