@@ -48,6 +48,7 @@ from gsmerge.types import Scene
 
 POINT_SCALE = np.float32(0.1)  # by which Gaussians are multiplied that are drawn as points
 BAR_SPREAD = 8  # largest difference of the colours within a bar, of 255
+JPEG_BLOCK = 16  # pixels of a side of the blocks in which a JPEG mixes colours, of which it keeps every other one
 _READ_PIXELS = 4 * OFFSET_PIXELS  # longer side of the photos that are compared
 _TILES = 4  # largest number of pictures in a row or a column of a photo
 _HALVES: tuple[Part, ...] = ((0, 0, 0.5, 1), (0.5, 0, 1, 1), (0, 0, 1, 0.5), (0, 0.5, 1, 1))
@@ -75,16 +76,14 @@ def list_parts(size: Size, shape: Size | None, inner: Part) -> list[PartFit]:
 def round_to_cameras(inner: Part, size: Size, shape: Size) -> Part:
     """Round the part ``inner`` of photos of a ``size`` to the size ``shape`` of the cameras, or to a multiple of it.
 
-    ``inner`` is the part inside of bars. JPEG files mix the pixels of a block of 8 x 8, so the measured size of
-    ``inner`` may be wrong by up to a block. The part is returned unchanged if rounding would change it by more than a
-    block, or if the rounded part would not fit into the photos.
+    ``inner`` is the part inside of bars, whose measured size may be wrong by up to a block of a JPEG. The part is
+    returned unchanged if rounding would change it by more, or if the rounded part would not fit into the photos.
     """
     width, height = part_size(size, inner)
     times = max(1, round(width / shape[0]))
     sides = times * shape[0], times * shape[1]
-    jpeg_block = 8  # pixels of a side of the blocks of a JPEG
     if (
-        max(abs(width - sides[0]), abs(height - sides[1])) > jpeg_block
+        max(abs(width - sides[0]), abs(height - sides[1])) > JPEG_BLOCK
         or max(sides[0] / size[0], sides[1] / size[1]) > 1
     ):
         return inner
@@ -140,6 +139,17 @@ def find_crop(
     return PartFit((-left / width, -top / height, (shape[0] - left) / width, (shape[1] - top) / height))
 
 
+def find_edge(lines: np.ndarray, width: int) -> int:
+    """Find the edge of a bar of about ``width`` of the ``lines [n,m,3]`` of a photo: the largest difference of two.
+
+    JPEG files mix the pixels of a block, so that a bar seems to end up to a block before its edge.
+    """
+    if width == 0:
+        return 0
+    near = lines[width - 1 : width + JPEG_BLOCK + 1].astype(np.float32)
+    return width + int(np.abs(np.diff(near, axis=0)).mean((1, 2)).argmax())
+
+
 def read_small(paths: Sequence[Path], sizes: Sequence[Size]) -> tuple[list[np.ndarray], Part]:
     """Read photos of ``sizes`` as small pictures, and find the part of a photo that is usually inside of bars.
 
@@ -153,8 +163,11 @@ def read_small(paths: Sequence[Path], sizes: Sequence[Size]) -> tuple[list[np.nd
         if isinstance(whole, SceneError):
             return np.zeros((OFFSET_PIXELS, OFFSET_PIXELS, 3), np.float32), np.zeros(4)
         above, below, left, right = count_bars(whole, BAR_SPREAD)
+        columns = whole.swapaxes(0, 1)
+        sides = (columns, left), (whole, above), (columns[::-1], right), (whole[::-1], below)
+        widths = [find_edge(lines, width) for lines, width in sides]
         small = resize_to(size, limit_size(size, _READ_PIXELS)).photos([whole])[0]
-        return small / np.float32(255), np.array([left, above, right, below]) / (size * 2)
+        return small / np.float32(255), np.array(widths) / (size * 2)
 
     pictures, bars = zip(*parallel_map(read, range(len(paths))), strict=True)
     left, above, right, below = np.median(bars, 0).tolist()
@@ -187,14 +200,10 @@ def choose_part(
 
     pictures, inner = read_small(paths, sizes)
     view_size = next(iter(sizes_of(camera_file)), (scene.cameras.width, scene.cameras.height))
-    fits: list[GridFit | PartFit]
-    if explain_most and grid_fit is None:
-        fits = [WHOLE_FIT]
-    elif grid_fit is None:
-        inner = round_to_cameras(inner, sizes[0], view_size)
-        fits = [*list_parts(sizes[0], view_size, inner)]
-    else:  # cameras were estimated, so parts may have any shape
-        fits = [grid_fit, *list_parts(sizes[0], None, inner)]
+    inner = inner if grid_fit else round_to_cameras(inner, sizes[0], view_size)
+    fits: list[GridFit | PartFit] = [grid_fit] if grid_fit else [WHOLE_FIT] if explain_most else []
+    if not explain_most:  # parts may have any shape if cameras were estimated
+        fits += list_parts(sizes[0], None if grid_fit else view_size, inner)
 
     points = scene
     if not scene.has_own_pixels:  # Gaussians hide what is behind them, which moves slanted surfaces; points hardly do

@@ -16,9 +16,10 @@ from messages import noted
 
 from gsmerge.io.photo_files import cut_part, part_size, reaches_beyond
 from gsmerge.method.geometry.transforms import sh0_to_rgb
+from gsmerge.method.kernels.pictures import count_bars
 from gsmerge.reading.photos import photo_parts
 from gsmerge.reading.photos.grid_fit import PartFit, clear_beyond
-from gsmerge.reading.photos.photo_parts import list_parts
+from gsmerge.reading.photos.photo_parts import BAR_SPREAD, find_edge, list_parts
 from gsmerge.reading.read_scene import load_scene
 
 SMOOTH = smooth_scene(48, 36)
@@ -142,6 +143,21 @@ def test_masks_are_cut_as_the_larger_photos_are(tmp_path: Path) -> None:
     assert scene.masks[:, :, 24:].all()
     assert not scene.masks[:, :, :24].any()
     assert (scene.large_photos.width, scene.large_photos.height) == (96, 72)
+
+
+@pytest.mark.parametrize("quality", [50, 80, 95])
+@pytest.mark.parametrize("level", [0, 255])
+def test_the_edge_of_a_bar_is_found_in_a_jpeg(quality: int, level: int) -> None:
+    """Its blocks of 16 pixels have lines that look neither like the bar nor like the photo."""
+    photo = np.random.default_rng(0).integers(60, 200, (12, 17, 3), np.uint8)
+    photo = cv2.resize(photo, (170, 120), interpolation=cv2.INTER_CUBIC)
+    framed = cv2.copyMakeBorder(photo, 20, 45, 23, 20, cv2.BORDER_CONSTANT, value=(level,) * 3)
+    stored = cv2.imdecode(cv2.imencode(".jpg", framed, [cv2.IMWRITE_JPEG_QUALITY, quality])[1], cv2.IMREAD_COLOR)
+    above, below, left, right = count_bars(stored, BAR_SPREAD)
+    columns = stored.swapaxes(0, 1)
+    sides = [(stored, above), (stored[::-1], below), (columns, left), (columns[::-1], right)]
+    assert max(above, left) < 23  # or nothing is shown
+    assert [find_edge(lines, width) for lines, width in sides] == [20, 45, 23, 20]
 
 
 def test_parts_have_the_shape_of_views_or_are_stretched_to_it() -> None:
