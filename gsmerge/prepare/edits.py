@@ -15,13 +15,13 @@ import cv2
 import numpy as np
 
 from gsmerge.arrays import distinct, max_columns, mean_columns
-from gsmerge.method.compare.view_pictures import fit_size
+from gsmerge.method.compare.view_pictures import fit_size, pair_photos
 from gsmerge.method.geometry.transforms import camera_centres, camera_depths, project, sh0_to_rgb
 from gsmerge.method.kernels.pictures import convolve
 from gsmerge.method.kernels.raster.project import view_colors
 from gsmerge.method.raster import render
 from gsmerge.method.raster.photos import COVERED_TRANSMITTANCE, counting_pixels, pixel_weights
-from gsmerge.prepare.compare_photos import COMPARED_OPACITY
+from gsmerge.prepare.compare_photos import COMPARED_OPACITY, correct_tones
 from gsmerge.prepare.photo_change import KEEP, PhotoChange, change_large
 from gsmerge.runtime.threads import parallel_map
 from gsmerge.types import PicturedScene, Pixels, Scene
@@ -68,6 +68,8 @@ def follow_edits(scene: Scene) -> tuple[Scene, str]:
         return scene, ""
     shares = _measure_shares(pictured, rows, edited)
     is_dense = _are_dense(shares)
+    if is_dense and not scene.has_own_pixels and correct_tones(pictured, pair_photos(pictured, scene.images), views)[1]:
+        return scene, ""  # photos of another tone have the colours of no Gaussian
     left = np.zeros(scene.images.shape[:3], bool)  # pixels whose own Gaussians are gone
     unedited = scene
     if is_dense and scene.has_own_pixels:

@@ -192,6 +192,14 @@ def test_pixels_that_do_not_count_are_no_edit() -> None:
     assert_unchanged(cropped)
 
 
+@pytest.mark.parametrize(("factors", "gamma"), [((1.3, 1.15, 0.95), 1), ((1.2, 1.05, 0.8), 1), ((1, 1, 1), 1.3)])
+def test_photos_of_another_tone_are_no_edit(factors: tuple[float, float, float], gamma: float) -> None:
+    """As of an editor that changes all photos alike: a part of them then has the colours of no Gaussian."""
+    scene = scenes.make_scene(scenes.room(), scenes.arc(VIEWS, WIDTH, HEIGHT))
+    toned = (scene.images ** np.float32(gamma) * np.array(factors, np.float32)).clip(0, 1)
+    assert_unchanged(replace(scene, images=toned, pixels=None))
+
+
 def test_scenes_of_two_views_stay() -> None:
     assert_unchanged(insert_ball(solid([WALL], 2), solid([BALL, WALL], 2)))
 
