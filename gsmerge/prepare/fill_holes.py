@@ -188,7 +188,7 @@ def _find_known(
             depths, farthest = known[view]
             edges[view] = _Edges(depths[is_hole], farthest, depths[is_hole])
 
-    sample = thin_out(scene.gaussians, len(scene.gaussians) // DRAWN_OF)
+    sample = thin_out(scene.gaussians, max(1, len(scene.gaussians) // DRAWN_OF))
     tile_views(sample, scene.cameras, find_holes, list(known), parts)
     return list(known)
 
