@@ -140,14 +140,15 @@ def find_crop(
 
 
 def find_edge(lines: np.ndarray, width: int) -> int:
-    """Find the edge of a bar of about ``width`` of the ``lines [n,m,3]`` of a photo: the largest difference of two.
+    """Find the edge of a bar of about ``width`` of the ``lines [n,m,3]`` of a photo.
 
     JPEG files mix the pixels of a block, so that a bar seems to end up to a block before its edge.
     """
     if width == 0:
         return 0
     near = lines[width - 1 : width + JPEG_BLOCK + 1].astype(np.float32)
-    return width + int(np.abs(np.diff(near, axis=0)).mean((1, 2)).argmax())
+    steps = np.abs(np.diff(near, axis=0)).mean((1, 2))
+    return width + int((steps >= steps.max() / 2).argmax())  # steps within a bar are far smaller than its edge
 
 
 def read_small(paths: Sequence[Path], sizes: Sequence[Size]) -> tuple[list[np.ndarray], Part]:
