@@ -10,9 +10,9 @@ from functools import cache, partial
 
 import numpy as np
 
-from gsmerge.errors import SceneError, attempt
+from gsmerge.errors import Doubt, SceneError, attempt
 from gsmerge.frozen import dataclass, replace
-from gsmerge.io.cameras.camera_file import CameraFile
+from gsmerge.io.cameras.camera_file import CameraFile, select_views
 from gsmerge.io.formats.read_gaussians import GaussianFile
 from gsmerge.io.formats.rows import RESULT_COMMENT
 from gsmerge.io.image_names import IMAGE_PLACES, describe_unread
@@ -39,8 +39,10 @@ from gsmerge.reading.photos.scene_photos import (
     keep_one_shape,
     name_by_photos,
     read_photos,
+    select_photos,
 )
 from gsmerge.reading.scene_files import SceneFiles, result_cameras
+from gsmerge.runtime.record import list_some
 
 Measure = Callable[[CameraFile, ScenePhotos], Evidence]
 MeasureBare = Callable[[CameraFile], Evidence]  # without photos, whatever lenses the cameras have
@@ -190,6 +192,7 @@ def _examine_photos(
     2. The scene is made with the proposed photos, or if these photos cannot be used, without photos.
     3. The views of this scene decide which photo belongs to a view. Parts of photos are used if the parts fit better.
     4. If the views show photos other than the proposed ones, the scene is made again.
+    5. Views without a photo are left out if the others explain the Gaussians as well: a camera file may have more.
 
     Notes name photos that cannot be read, and views without a photo. Raises SceneError if no photo shows a view.
     """
@@ -218,6 +221,36 @@ def _examine_photos(
         evidence = measure(name_by_photos(camera_file, checked), checked)
         if evidence.error is not None:
             raise evidence.error
+    fewer = _leave_out_idle(evidence, measure, measure_bare, camera_file, photos)
+    if fewer is not None:  # 5.
+        return fewer
     described = describe_assignment(checked, camera_file, are_pixels=trial.base.are_pixels)
     notes = (*checked.notes, *evidence.notes, *described, *doubts)
     return replace(evidence, notes=notes, photos_explain=checked.explain_most)
+
+
+def _leave_out_idle(
+    evidence: Evidence, measure: Measure, measure_bare: MeasureBare, camera_file: CameraFile, photos: ScenePhotos
+) -> Evidence | None:
+    """Examine cameras without those that have no photo, and no Gaussians at most of their pixels.
+
+    None if there are none, or if fewer Gaussians lie near pixels of the other cameras than of all.
+    """
+    scene = evidence.scene
+    if not evidence.are_pixels or not photos.named:
+        return None
+    views = {*range(len(scene))}
+    idle = views - {*np.flatnonzero(scene.get_pixels().shown.mean((1, 2)) > 0.5).tolist(), *scene.photo_views}
+    used = sorted(views - idle)
+    if not idle or not used:
+        return None
+    found = attempt(
+        _examine_photos, measure, measure_bare, select_views(camera_file, used), select_photos(photos, used)
+    )
+    if isinstance(found, SceneError) or len(found.scene.gaussians) < len(scene.gaussians):
+        return None
+    if (found.share_near or 0) < (evidence.share_near or 0):
+        return None
+    doubt = f"{len(idle)} of {len(scene)} cameras have no photos and are left out, as the others explain all Gaussians"
+    doubt += f": {list_some([scene.names[view] for view in sorted(idle)])}"
+    return replace(found, notes=(*found.notes, Doubt(doubt)))

@@ -376,7 +376,6 @@ def keep_one_shape(camera_file: CameraFile, photos: ScenePhotos) -> tuple[Camera
         for path, size in sizes.items()
         if not same_shape(size, (width, height)) and not (are_alike and same_shape(size, (height, width)))
     }
-    # a size of 1 pixel means that the camera has no size
     used = [
         view
         for view, (path, size) in enumerate(zip(photos.named, camera_sizes, strict=True))
@@ -388,11 +387,16 @@ def keep_one_shape(camera_file: CameraFile, photos: ScenePhotos) -> tuple[Camera
     unused = [camera_file.names[view] for view in range(len(camera_sizes)) if view not in used]
     if not unused:
         return camera_file, photos, []
-    named = tuple(photos.named[view] for view in used)
-    faults = tuple(photos.faults[view] for view in used)
-    photos = replace(photos, named=named, paths=named, turns=(0,) * len(used), faults=faults)
+    photos = select_photos(photos, used)
     doubt = f"{len(unused)} of {len(camera_sizes)} views are left out, since they do not have {shape}"
     return select_views(camera_file, used), photos, [Doubt(f"{doubt}: {list_some(unused)}")]
+
+
+def select_photos(photos: ScenePhotos, views: Sequence[int]) -> ScenePhotos:
+    """Return the photos that names propose for ``views``."""
+    named = tuple(photos.named[view] for view in views)
+    faults = tuple(photos.faults[view] for view in views)
+    return replace(photos, named=named, paths=named, turns=(0,) * len(views), faults=faults)
 
 
 def _list_candidates(photos: ScenePhotos) -> Candidates:
@@ -478,8 +482,7 @@ def has_other_shape(photos: ScenePhotos, camera_file: CameraFile, *, as_named: b
     if first is None or not shapes or is_known:
         return False
     size = photos.fit.stretch(part_size(image_size(first), photos.fit.part))
-    turned = (size,) if as_named else (size, size[::-1])
-    return not any(same_shape(shape, one) for shape in shapes for one in turned)
+    return not any(same_shape(shape, one) for shape in shapes for one in (size, size if as_named else size[::-1]))
 
 
 def have_fewer_pixels(photos: ScenePhotos, camera_file: CameraFile) -> bool:
@@ -576,8 +579,8 @@ def describe_missing(names: Sequence[str], stored: CameraFile | None, *, is_righ
     are_named = len(lacking) == count > 0
     if not (are_named or is_right):
         return None
-    examples = f" ({list_some(lacking)})" if are_named else ""
-    text = f"{count} of {len(names)} views {'has' if count == 1 else 'have'} no camera in {stored.path}{examples}"
+    text = f"{count} of {len(names)} views {'has' if count == 1 else 'have'} no camera in {stored.path}"
+    text += f" ({list_some(lacking)})" if are_named else ""
     return f"{text}: the poses and focal length of all views are estimated from the Gaussians' own grid"
 
 

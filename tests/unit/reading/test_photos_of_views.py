@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from messages import names
+from messages import names, noted
 from PIL import Image, features
 from plyfile import PlyData, PlyElement
 from shared import write_scene
@@ -106,6 +106,20 @@ def test_no_cameras_are_searched_for_photos_that_all_lie_on_their_side(
         Image.fromarray(np.ascontiguousarray(lying)).save(path, exif=exif)
     monkeypatch.setattr(unaligned, "find_frame", None)
     assert not load_with_right_photos(folder, truth).notes
+
+
+def test_cameras_without_a_photo_and_gaussians_are_left_out(folder: Path, truth: np.ndarray) -> None:
+    """As of a file of the whole capture, of which a model saw some photos."""
+    path = folder / "transforms.json"
+    data = json.loads(path.read_text())
+    frames = data["frames"]
+    pose = np.array(frames[0]["transform_matrix"])
+    pose[:3, 3] += pose[:3, 0] / 10
+    frames[2:2] = [dict(frames[0], file_path="images/unseen.png", transform_matrix=pose.tolist())]
+    path.write_text(json.dumps(data))
+    loaded = load_with_right_photos(folder, truth)
+    assert noted(loaded.doubts, "1 of 5 cameras", "left out", "images/unseen.png")
+    assert len(loaded.doubts) == 1
 
 
 def test_mirrored_photos_are_mirrored_back(folder: Path, truth: np.ndarray) -> None:
