@@ -305,13 +305,11 @@ def check_masks(masks: Masks, files: SceneFiles, scene: Scene) -> tuple[Masks, s
         return NO_MASKS, reason, [Doubt(f"masks are not used: {where}: {problem}; name them with --masks")]
     if 2 * _share_of_gaussians(scene, counts) < 1:
         reason += ", and most of what the Gaussians show"
+        invert = "if they are bright where photos do not count, invert them"
         if is_named:
-            return masks, reason, [
-                f"masks {where}: they {reason}; if they are bright where photos do not count, invert them"
-            ]  # fmt: skip
-        remedy = (
-            f"if they are right, name them with --masks, transparency saved as grey pictures; or pass --masks {NONE}"
-        )
+            return masks, reason, [f"masks {where}: they {reason}; {invert}"]
+        remedy = f"{invert}; if they are right, name them with --masks, transparency saved as grey pictures"
+        remedy += f"; or pass --masks {NONE}"
         return NO_MASKS, reason, [Doubt(f"masks are not used: {where}: they {reason}; {remedy}")]
     count = int((~counts.all((1, 2))).sum())
     kind = "transparency, masks or crops" if files.masks is None else "masks"
