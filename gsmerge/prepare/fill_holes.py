@@ -169,12 +169,16 @@ def _find_known(
     As no depth beside a hole counts, a sample of the Gaussians is drawn, and only the tiles ``parts`` of a view.
     ``fillable [v,h,w]`` marks pixels that may be filled. The result is written to ``holes [v,h,w]`` and ``edges``.
     """
+    if scene.depths is None:
+        return []
     fronts = scene.get_pixels().fronts
     known = dict[int, tuple[np.ndarray, float]]()  # depths of a view's pixels that may be filled, and the farthest
     for view in parts:
+        if 2 * np.count_nonzero(fronts[view] >= 0) < fronts[view].size:
+            continue
         pixels, own_depths = _sample_own(scene, view)
         depths = _fit_map(scene, view, pixels, own_depths)
-        if depths is None or 2 * np.count_nonzero(fronts[view] >= 0) < fronts[view].size:
+        if depths is None:
             continue
         (farthest,) = quantiles(own_depths, [FARTHEST_QUANTILE])
         if np.isfinite(depths[fillable[view]]).all():

@@ -144,13 +144,15 @@ def tile_views(
 
     ``tiles`` has masks of the tiles that have to be complete, see :func:`tile_view`; views without one are complete.
     """
+    view_ids = range(len(cameras)) if views is None else views
+    if not len(view_ids):
+        return
     splats, *_ = prepare_views(gaussians, cameras)
 
     def tile_and_use(view: int) -> None:
         """Tile one view, and call ``use`` for it."""
         use(view, tile_camera(splats, cameras, view, tiles=None if tiles is None else tiles.get(view)))
 
-    view_ids = range(len(cameras)) if views is None else views
     if len(splats) <= ONE_AT_A_TIME:
         parallel_map(tile_and_use, view_ids)
         return
