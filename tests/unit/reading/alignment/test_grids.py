@@ -42,9 +42,15 @@ def before_mapping(tiny: Tiny, mapping: PhotoTransform, size: tuple[int, int]) -
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("resize", [resize_to, resize_and_crop])
+@pytest.mark.parametrize(
+    ("resize", "start"),
+    [
+        (resize_to, "photos of 110 x "),
+        (resize_and_crop, "bars around the photos are cut off: 110 x 72 pixels become 96 x 72"),  # its edges repeat
+    ],
+)
 def test_larger_photos_are_resized_or_cropped_to_the_grid(
-    resize: Callable[..., PhotoTransform], tmp_path: Path
+    resize: Callable[..., PhotoTransform], start: str, tmp_path: Path
 ) -> None:
     """An npz at the grid's size, photos as they were taken: stretched or cropped, as their colours say."""
     _, photos = before_mapping(SMOOTH, resize((110, 72), (48, 36)), (110, 72))
@@ -53,7 +59,7 @@ def test_larger_photos_are_resized_or_cropped_to_the_grid(
     write_npz(tmp_path / "results.npz", SMOOTH, image=None, depth=np.ones((3, 36, 48), np.float32))
     loaded = load_scene(tmp_path, images=tmp_path / "images", order="view-major")
     assert np.abs(loaded.scene.images * 255 - SMOOTH.images).mean() < 8  # of 255: the photos were resized twice
-    assert noted(loaded.notes, "110 x 72")  # edges that are repeated may be taken for bars, which is right, too
+    assert any(note.startswith(start) for note in loaded.notes)
 
 
 def test_cameras_of_uncropped_pictures_are_cropped_to_the_images(tmp_path: Path) -> None:
