@@ -237,20 +237,23 @@ def _leave_out_idle(
     None if there are none, or if fewer Gaussians lie near pixels of the other cameras than of all.
     """
     scene = evidence.scene
-    if not evidence.are_pixels or not photos.named:
+    without_photo = sorted({*range(len(scene))} - {*scene.photo_views})
+    if not without_photo or not evidence.are_pixels or not photos.named:
         return None
-    views = {*range(len(scene))}
-    idle = views - {*np.flatnonzero(scene.get_pixels().shown.mean((1, 2)) > 0.5).tolist(), *scene.photo_views}
-    used = sorted(views - idle)
+    shares = scene.get_pixels().shown.mean((1, 2))
+    idle = [view for view in without_photo if shares[view] <= 0.5]
+    used = [view for view in range(len(scene)) if view not in idle]
     if not idle or not used:
         return None
     found = attempt(
         _examine_photos, measure, measure_bare, select_views(camera_file, used), select_photos(photos, used)
     )
-    if isinstance(found, SceneError) or len(found.scene.gaussians) < len(scene.gaussians):
-        return None
-    if (found.share_near or 0) < (evidence.share_near or 0):
+    if (
+        isinstance(found, SceneError)
+        or len(found.scene.gaussians) < len(scene.gaussians)
+        or (found.share_near or 0) < (evidence.share_near or 0)
+    ):
         return None
     doubt = f"{len(idle)} of {len(scene)} cameras have no photos and are left out, as the others explain all Gaussians"
-    doubt += f": {list_some([scene.names[view] for view in sorted(idle)])}"
+    doubt += f": {list_some([scene.names[view] for view in idle])}"
     return replace(found, notes=(*found.notes, Doubt(doubt)))

@@ -49,7 +49,6 @@ from gsmerge.types import Scene
 POINT_SCALE = np.float32(0.1)  # by which Gaussians are multiplied that are drawn as points
 BAR_SPREAD = 8  # largest difference of the colours within a bar, of 255
 JPEG_BLOCK = 16  # pixels of a side of the blocks in which a JPEG mixes colours, of which it keeps every other one
-_READ_PIXELS = 4 * OFFSET_PIXELS  # longer side of the photos that are compared
 _TILES = 4  # largest number of pictures in a row or a column of a photo
 _HALVES: tuple[Part, ...] = ((0, 0, 0.5, 1), (0.5, 0, 1, 1), (0, 0, 1, 0.5), (0, 0.5, 1, 1))
 
@@ -126,7 +125,7 @@ def find_crop(
     scale = left = top = 0.0
     finest = min(max(shape), 2 * max(photos[0].shape))  # photos of half of their views have pixels as large as these
     for side, step in ((OFFSET_PIXELS // 4, 0.02), (OFFSET_PIXELS, 0.005), (finest, 0.001)):
-        if side == finest and scale == largest and same_shape(size, shape):  # photos show their whole views
+        if step < 0.005 and scale == largest and same_shape(size, shape):  # photos show their whole views
             break
         shown = show(side)
         spread = CONTRAST_PIXELS * side // OFFSET_PIXELS
@@ -167,7 +166,7 @@ def read_small(paths: Sequence[Path], sizes: Sequence[Size]) -> tuple[list[np.nd
         columns = whole.swapaxes(0, 1)
         sides = (columns, left), (whole, above), (columns[::-1], right), (whole[::-1], below)
         widths = [find_edge(lines, width) for lines, width in sides]
-        small = resize_to(size, limit_size(size, _READ_PIXELS)).photos([whole])[0]
+        small = resize_to(size, limit_size(size, 4 * OFFSET_PIXELS)).photos([whole])[0]
         return small / np.float32(255), np.array(widths) / (size * 2)
 
     pictures, bars = zip(*parallel_map(read, range(len(paths))), strict=True)
@@ -202,7 +201,7 @@ def choose_part(
     pictures, inner = read_small(paths, sizes)
     view_size = next(iter(sizes_of(camera_file)), (scene.cameras.width, scene.cameras.height))
     inner = inner if grid_fit else round_to_cameras(inner, sizes[0], view_size)
-    fits: list[GridFit | PartFit] = [grid_fit] if grid_fit else [WHOLE_FIT] if explain_most else []
+    fits: list[GridFit | PartFit] = [grid_fit or WHOLE_FIT] if grid_fit or explain_most else []
     if not explain_most:  # parts may have any shape if cameras were estimated
         fits += list_parts(sizes[0], None if grid_fit else view_size, inner)
 

@@ -280,7 +280,8 @@ def test_found_masks_that_hide_most_of_the_scene_are_none(tmp_path: Path, is_inv
         write(folder / "masks" / name, 255 - mask if is_inverted else mask)
     load = load_scene(folder)
     assert (load.scene.masks is None) == is_inverted
-    assert [names(doubt, "leave out 79 %", "invert them", "--masks none") for doubt in load.doubts] == [True] * is_inverted
+    said = [names(doubt, "leave out 79 %", "invert them", "--masks none") for doubt in load.doubts]
+    assert said == [True] * is_inverted
     named = load_scene(folder, masks=folder / "masks")
     assert named.scene.masks is not None
     assert not named.doubts
